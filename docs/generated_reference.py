@@ -72,15 +72,8 @@ def _parameter_row(field: ConfigurationField) -> tuple[str, ...]:
         shown = "[" + ", ".join(str(entry) for entry in default) + "]"
     else:
         shown = str(default).lower() if field.kind is bool else str(default)
-    low, high = about.minimum, about.maximum
-    if about.choices:
-        bounds = ", ".join(code(choice) for choice in about.choices)
-    elif field.kind is bool:
-        bounds = "true, false"
-    elif low is not None and high is not None:
-        bounds = f"{low:g} to {high:g}"
-    else:
-        bounds = "" if low is high is None else f"at least {low:g}" if low is not None else f"at most {high:g}"
+    bounds = ", ".join(map(code, about.choices)) or {bool: "true, false"}.get(field.kind, about.bounds)
+    bounds = bounds.removeprefix("from ").removeprefix("of ")
     return code(field.name), code(shown), about.unit, bounds, about.description
 
 

@@ -19,7 +19,12 @@ from typing import Any
 
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE
+from magnetosuture_thread.thread.material import (
+    MATERIALS,
+    MAX_ELASTIC_MODULUS,
+    MAX_REST_ANGLE,
+    MIN_ELASTIC_MODULUS,
+)
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"
@@ -97,15 +102,16 @@ def stiffness_over_drag(settings: Settings) -> float:
 
 def with_stiffness_over_drag(settings: Settings, value: float) -> Settings:
     """Return settings whose `elastic_modulus` gives this B at their own drag."""
-    of_one = stiffness_over_drag(replace(settings, elastic_modulus=1.0))
-    return replace(settings, elastic_modulus=value / of_one)
+    per_modulus = stiffness_over_drag(replace(settings, elastic_modulus=MIN_ELASTIC_MODULUS)) / MIN_ELASTIC_MODULUS
+    return replace(settings, elastic_modulus=value / per_modulus)
 
 
 def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
     middle = stiffness_over_drag(replace(settings, elastic_modulus=0.0))  # the material's
-    # Just within what a setup may say [Pa].
-    most = stiffness_over_drag(replace(settings, elastic_modulus=0.99e12))
-    return 1e-3 * middle, min(1e3 * middle, most)
+    # Just within what a setup may say.
+    extremes = (1.01 * MIN_ELASTIC_MODULUS, 0.99 * MAX_ELASTIC_MODULUS)
+    least, most = (stiffness_over_drag(replace(settings, elastic_modulus=modulus)) for modulus in extremes)
+    return max(1e-3 * middle, least), min(1e3 * middle, most)
 
 
 def _curvature_bounds(settings: Settings) -> tuple[float, float]:

@@ -19,11 +19,10 @@ from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibra
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
 from magnetosuture_thread.coils.filter import NeedleSafetyFilter
 from magnetosuture_thread.geometry.barrier import load_barriers
-from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 # Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
 MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}
@@ -33,7 +32,9 @@ MAX_BLIND_DISTANCE = 0.0125  # m; maximum distance of free motion within the hol
 
 
 @dataclass(frozen=True)
-class CoilBridgeSettings(Configuration):
+class CoilBridgeSettings(
+    shared.SceneName, shared.CommandFilter, shared.NeedleArc, shared.NeedleWidth, shared.CoilDrivers
+):
     """Parameters of the coil bridge: coils, needle, limits, timeouts and driver."""
 
     GROUP: ClassVar[str] = "coil_bridge"
@@ -79,9 +80,6 @@ class CoilBridgeSettings(Configuration):
         1000.0, "maximum slew rate of a current; a stop is not limited", unit="A/s", minimum=1.0, maximum=1e6
     )
 
-    scene: str = shared_parameter("scene")
-    keep_out: float = shared_parameter("keep_out")
-    pose_margin: float = shared_parameter("pose_margin")
     barriers: tuple[str, ...] = quantity((), "barriers of your own for the needle, each as module:class; see Barrier")
     approach_rate: float = quantity(
         10.0,
@@ -100,7 +98,6 @@ class CoilBridgeSettings(Configuration):
     prediction_timeout: float = quantity(
         0.5, "margins of the thread model are valid for this long", unit="s", minimum=0.05, maximum=5.0
     )
-    friction_feedback: str = shared_parameter("friction_feedback")
     without_prediction: str = quantity(
         "stop",
         "behaviour while the thread is not predicted: stop, or slow, to speed_without_prediction",
@@ -123,9 +120,6 @@ class CoilBridgeSettings(Configuration):
     aligning_field: float = quantity(
         0.008, "field along the needle that holds its direction", unit="T", minimum=1e-4, maximum=1.0
     )
-    needle_length: float = shared_parameter("needle_length")
-    needle_width: float = shared_parameter("needle_width")
-    needle_curvature: float = shared_parameter("needle_curvature")
     needle_moment: float = quantity(
         8.8e-4, "magnetic moment of the straight needle", unit="A m^2", minimum=1e-6, maximum=1.0
     )
@@ -148,7 +142,6 @@ class CoilBridgeSettings(Configuration):
     needle_turning_drag: float = quantity(
         1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2
     )
-    coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
 
     coil_resistance: float = quantity(
         1.0,
@@ -167,7 +160,6 @@ class CoilBridgeSettings(Configuration):
         maximum=135,
     )
     roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
-    driver_timeout: float = shared_parameter("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
         0.03,
         "timeout of a board's answer, which takes 1 or 2 ms over USB; one timeout is tolerated",
@@ -275,8 +267,7 @@ class CoilBridgeSettings(Configuration):
         return made
 
     def check(self) -> None:
-        """Reject too few coils, a coiled needle, and limits that cannot be kept."""
-        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
+        """Reject too few coils, and limits that cannot be kept."""
         if len(self.coil_angles) < 3:
             raise self.refused("coil_angles", "at least 3 coils' angles [rad]")
         if self._calibration is not None:

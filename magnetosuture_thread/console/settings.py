@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from magnetosuture_thread.console.access import is_loopback, is_origin
-from magnetosuture_thread.geometry.needle_arc import check_needle
-from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
-class ConsoleSettings(Configuration):
+class ConsoleSettings(shared.SceneName, shared.NeedleArc):
     """Address, token and jog limits of the operator page."""
 
     GROUP: ClassVar[str] = "console"
@@ -29,9 +28,6 @@ class ConsoleSettings(Configuration):
         "", "under which browsers reach the page besides its address: a name, or a TLS proxy, as https://rig.example"
     )
     image_transport: str = quantity("compressed", "camera topic to show", choices=("compressed", "raw"))
-    scene: str = shared_parameter("scene")
-    needle_length: float = shared_parameter("needle_length")
-    needle_curvature: float = shared_parameter("needle_curvature")
     frame_rate: float = quantity(30.0, "of the states sent to the page", unit="Hz", minimum=1.0, maximum=120.0)
     speed: float = quantity(0.003, "initial jog speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
     max_speed: float = quantity(0.01, "maximum jog speed", unit="m/s", minimum=1e-5, maximum=0.5)
@@ -44,9 +40,8 @@ class ConsoleSettings(Configuration):
         """Reject what does not fit.
 
         A public page without a token, a key without a certificate, an origin that is none, a speed above the maximum,
-        a short timeout, and a coiled needle.
+        and a short timeout.
         """
-        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         is_token = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable() and " " not in self.token
         exposed = f"a token, as {self.address} can be reached from other machines"
         origin = "scheme and name, and a port if it is another than the scheme's, as https://rig.example"

@@ -13,15 +13,19 @@ from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, T
 from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG
 from magnetosuture_thread.geometry.barrier import Barrier, load_barriers
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.settings.configuration import (
-    Configuration,
-    autostart_parameter,
-    configuration_fields,
-    quantity,
-)
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import configuration_fields, quantity
 from magnetosuture_thread.thread.margins import FrictionLaw
-from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
+from magnetosuture_thread.thread.material import (
+    MATERIALS,
+    MAX_ELASTIC_MODULUS,
+    MAX_REST_ANGLE,
+    MIN_ELASTIC_MODULUS,
+    Attachment,
+    Material,
+    Medium,
+    Thread,
+)
 from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
@@ -48,13 +52,18 @@ FIXED = {  # why a node cannot change it while it is configured
 
 
 @dataclass(frozen=True)
-class ThreadModelSettings(Configuration):
+class ThreadModelSettings(
+    shared.LifecycleSettings,
+    shared.SceneName,
+    shared.ThreadLength,
+    shared.Viscosity,
+    shared.CommandFilter,
+    shared.NeedleArc,
+):
     """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
 
     GROUP: ClassVar[str] = "thread_model"
 
-    autostart: str = autostart_parameter()
-    scene: str = shared_parameter("scene")
     formulation: str = quantity(
         "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
     )
@@ -63,9 +72,8 @@ class ThreadModelSettings(Configuration):
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
     diameter: float = quantity(0.0, "of the thread; 0 takes the material's", "m", 0.0, 0.01)
     elastic_modulus: float = quantity(
-        0.0, "effective modulus of the thread in bending; 0 takes the material's", "Pa", 0.0, 1e12
+        0.0, "effective modulus of the thread in bending; 0 takes the material's", "Pa", 0.0, MAX_ELASTIC_MODULUS
     )
-    thread_length: float = shared_parameter("thread_length")
     segments: int = quantity(25, "number of segments, n", "", 3, 2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
@@ -85,7 +93,6 @@ class ThreadModelSettings(Configuration):
     medium: str = quantity(
         "liquid", "liquid drags the thread, in air its inertia and weight count; for rod", choices=("liquid", "air")
     )
-    viscosity: float = shared_parameter("viscosity")
     wetted_fraction: float = quantity(
         0.5, "part of the thread's surface in the liquid; half for a floating thread", "", 0.05, 1.0
     )
@@ -169,16 +176,14 @@ class ThreadModelSettings(Configuration):
     forecast_period: float = quantity(
         0.0, "time between estimates that are forecast; 0 for every one, as time allows", "s", 0.0, 10.0
     )
-    friction_feedback: str = shared_parameter("friction_feedback")
-    keep_out: float = shared_parameter("keep_out")
-    pose_margin: float = shared_parameter("pose_margin")
-    needle_length: float = shared_parameter("needle_length")
-    needle_curvature: float = shared_parameter("needle_curvature")
 
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
         if self.friction_threshold > self.margin_range:
             raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
+        if 0.0 < self.elastic_modulus < MIN_ELASTIC_MODULUS:
+            words = f"at least {MIN_ELASTIC_MODULUS:g} Pa, as of silicone rubber, or 0 for the material's"
+            raise self.refused("elastic_modulus", words)
         diameter, segments = self._material().diameter, self.segments
         if self.thread_length / segments <= diameter:
             most = math.ceil(self.thread_length / diameter) - 1

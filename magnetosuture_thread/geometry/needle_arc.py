@@ -8,9 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.settings.errors import ConfigurationError
-
-MAX_NEEDLE_TURN = 1.02 * np.pi  # of a needle, tail to tip [rad]; a little more than what suture needles have
 
 
 def needle_axis(
@@ -77,19 +74,3 @@ def needle_points(length: float, curvature: float, spacing: float) -> tuple[Poin
     chord, turned = needle_chord(length, curvature)
     apart = (points - 0.5 * chord * turned[:, 0]) / (0.5 * chord)
     return points, np.column_stack([-apart[:, 1], apart[:, 0]])
-
-
-def check_needle(group: str, length: float, curvature: float) -> None:
-    """Check that a needle is bent no more than a half circle, as its chord would not be along it any more.
-
-    Args:
-        group: section of the settings, for the error.
-        length: of the arc [m].
-        curvature: [1/m].
-
-    Raises:
-        ConfigurationError: the arc turns by more.
-    """
-    if abs(curvature) * length > MAX_NEEDLE_TURN:
-        expectation = f"at most {MAX_NEEDLE_TURN / length:.0f} 1/m, a half circle for a needle of {length:g} m"
-        raise ConfigurationError(f"{group}.needle_curvature", curvature, expectation)

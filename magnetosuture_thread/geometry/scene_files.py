@@ -38,12 +38,12 @@ from magnetosuture_thread.geometry.scene_shapes import (
     scene_to_mapping,
     shape_from_mapping,
 )
-from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, read_yaml
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import read_yaml
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import read_regular
 from magnetosuture_thread.settings.outputs import output_problem
 from magnetosuture_thread.settings.resources import find_scene_file
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 from magnetosuture_thread.settings.untrusted import MAX_TEXT_BYTES
 
 GEOJSON_ENDINGS = (".json", ".geojson")
@@ -242,13 +242,10 @@ def _defined(shape: SceneShape, properties: Mapping[str, Any], source: str) -> S
 
 
 @dataclass(frozen=True)
-class SceneServerSettings(Configuration):
+class SceneServerSettings(shared.LifecycleSettings, shared.SceneName):
     """The scene that is published first."""
 
     GROUP: ClassVar[str] = "scene_server"
-
-    autostart: str = autostart_parameter()
-    scene: str = shared_parameter("scene")
 
 
 class SceneEditor:

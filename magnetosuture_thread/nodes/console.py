@@ -30,7 +30,7 @@ from magnetosuture_thread.nodes import console_state as page
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, Latest, Services, answer_requests
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PERIOD, GuardedNode
-from magnetosuture_thread.nodes.parameters import declare, given_parameters, init
+from magnetosuture_thread.nodes.parameters import declare, init
 from magnetosuture_thread.nodes.run import end_signals
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.camera import encode_jpeg
@@ -370,7 +370,7 @@ def main(arguments: list[str] | None = None) -> int:
         # rclpy's own service of types is answered by an executor only.
         options = {"parameter_overrides": [Parameter("start_type_description_service", value=False)]}
         node = GuardedNode(NAME, **options)
-        asyncio.run(_serve(node, declare(node, ConsoleSettings, given_parameters(node, NAME, options))))
+        asyncio.run(_serve(node, declare(node, ConsoleSettings, options)))
     except KeyboardInterrupt:
         return 0
     except (MagnetosutureError, ParameterException, OSError) as error:

@@ -34,7 +34,7 @@ from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.parameters import as_declared, declare, given_parameters, plain_value
+from magnetosuture_thread.nodes.parameters import declare, plain_value
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError
@@ -359,11 +359,10 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         every = dict.fromkeys((each.name for each in configuration_fields(settings)), "")
         self._fixed = every if fixed is None else fixed
         try:
-            declare(self, settings, given_parameters(self, name, options), read_only=False, fixed=self._fixed)
+            declare(self, settings, options, read_only=False, fixed=self._fixed)
         except ConfigurationError:
             self._leave()
             raise
-        self.add_pre_set_parameters_callback(lambda parameters: as_declared(settings, parameters))
         self.add_on_set_parameters_callback(self._check_change)
         self.add_post_set_parameters_callback(self._put_in_force)
 

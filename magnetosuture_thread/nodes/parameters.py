@@ -8,17 +8,18 @@ as the command line reads.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType, SimpleNamespace
-from typing import Any, TypeVar, cast
-from weakref import WeakKeyDictionary
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary, ref
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.context import Context
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
@@ -31,21 +32,15 @@ from magnetosuture_thread.settings.configuration import (
     configuration_fields,
     from_mapping,
     parse_parameter_value,
-    to_mapping,
+    suggest_names,
 )
-from magnetosuture_thread.settings.parameter_files import (
-    EVERY_NODE,
-    check_list_value,
-    format_key,
-    key_matches,
-    node_of_key,
-    read_sections,
-)
+from magnetosuture_thread.settings.parameter_files import EVERY_NODE, key_matches, names_of, read_sections
 from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 
 C = TypeVar("C", bound=Configuration)
 
 _ARGUMENTS: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()  # of each context, where it is known
+_TYPES = {bool: "BOOL", int: "INTEGER", float: "DOUBLE", str: "STRING"}  # names of `Parameter.Type`
 
 
 def init(arguments: Sequence[str] | None = None, context: Context | None = None, **options: Any) -> None:
@@ -59,50 +54,55 @@ def init(arguments: Sequence[str] | None = None, context: Context | None = None,
     Raises:
         ConfigurationError: a parameter file does not exist, or is none.
     """
-    given = list(sys.argv if arguments is None else arguments)
-    for flag, value in _flags(given):
+    line = list(sys.argv if arguments is None else arguments)
+    for flag, value in _flags(line):
         if flag == "--params-file":
             read_sections(Path(value))
     context = context or get_default_context()
-    rclpy.init(args=given, context=context, **options)
-    _ARGUMENTS[context] = given
+    rclpy.init(args=line, context=context, **options)
+    _ARGUMENTS[context] = line
 
 
-def given_parameters(node: Node, kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that are meant for a node, by name, without those of rclpy; what comes later counts.
+def declare(
+    node: Node,
+    cls: type[C],
+    options: Mapping[str, Any],
+    *,
+    read_only: bool = True,
+    fixed: Mapping[str, str] | None = None,
+) -> C:
+    """Declare every field of a configuration class and return the settings in force.
 
-    `use_sim_time` is put in force here, as rcl does not know sections by a node's kind.
+    Their values are those of the parameter files and the command line that are meant for this node, of which the later
+    one counts. Shared parameters that the class does not know are meant for others, and left aside. `use_sim_time` is
+    put in force, as rcl does not know sections by a node's kind.
 
     Args:
-        node: in any namespace and under any name.
-        kind: the node's own name, under which parameter files know it whatever it is renamed to.
+        node: that gets the parameters, in any namespace and under any name.
+        cls: the configuration class; by its `GROUP` parameter files know the node whatever it is renamed to.
         options: as given to the node: `cli_args`, `parameter_overrides` and others of rclpy.
+        read_only: whether they stay as they are for good.
+        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; for their
+            descriptions.
 
     Raises:
-        ConfigurationError: a parameter file cannot be used, or nothing in it is for this node.
+        ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds, a parameter file cannot be
+            used, or nothing in it is for this node.
     """
-    arguments = list(_flags(options.get("cli_args") or []))  # the node's own override the process's
-    if options.get("use_global_arguments", True):
-        context, default = options.get("context"), get_default_context()
-        # Those that the context was initialised with: as `init` saw them, else the process's own.
-        whole = _ARGUMENTS.get(context or default, sys.argv if context in (None, default) else [])
-        arguments = [*_flags(whole), *arguments]
-    given: dict[str, Any] = {}
-    for flag, value in arguments:
-        if flag == "--params-file":
-            for key, section in _sections_for(Path(value), kind, node.get_fully_qualified_name()):
-                for name, entry in section.items():
-                    check_list_value(f"{key}.{name}", entry, value)
-                given.update(section)
-        elif flag in ("-p", "--param"):
-            left, _, right = value.partition(":=")
-            owner, _, name = left.rpartition(":")
-            if owner in ("", kind, node.get_name()):
-                given[name] = parse_parameter_value(right)
-    given.update({each.name: plain_value(each) for each in options.get("parameter_overrides") or []})
-    if isinstance(clock := given.get("use_sim_time"), bool):
+    values = _parameters(cls.GROUP, node.get_fully_qualified_name(), options)
+    if isinstance(clock := values.get("use_sim_time"), bool):
         node.set_parameters([Parameter("use_sim_time", value=clock)])
-    return {name: value for name, value in given.items() if name.split(".")[0] not in ROS_PARAMETERS}
+    others = {*SHARED_PARAMETERS, *ROS_PARAMETERS} - names_of(cls)
+    settings = from_mapping(cls, {name: value for name, value in values.items() if name.split(".")[0] not in others})
+    fields = configuration_fields(cls)
+    for setting in fields:  # by their types: by its value rclpy would take an empty list for one of bytes, for good
+        node.declare_parameter(setting.name, _type(setting), ignore_override=True)
+    node.set_parameters_atomically([_parameter(setting, getattr(settings, setting.name)) for setting in fields])
+    for setting in fields:
+        node.set_descriptor(setting.name, _descriptor(setting, read_only, (fixed or {}).get(setting.name)))
+    weak = ref(node)  # where a constructor fails, nothing may keep the node: it would stay in the graph
+    node.add_pre_set_parameters_callback(lambda parameters: _as_declared(weak(), cls, parameters))
+    return settings
 
 
 def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
@@ -118,19 +118,35 @@ def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
     Raises:
         ConfigurationError: a value is invalid.
     """
+    overrides = [item for item in options.get("parameter_overrides") or [] if item.name in SHARED_PARAMETERS]
     name = f"{node.get_fully_qualified_name().rpartition('/')[0]}/{cls.GROUP}"
-    other = SimpleNamespace(
-        get_name=lambda: cls.GROUP, get_fully_qualified_name=lambda: name, set_parameters=lambda _: None
-    )
-    own = [each for each in options.get("parameter_overrides") or [] if each.name in SHARED_PARAMETERS]
-    known, given = {each.name for each in configuration_fields(cls)}, {each.name: plain_value(each) for each in own}
-    with suppress(ConfigurationError):  # a file that is for this node alone
-        given = given_parameters(cast(Node, other), cls.GROUP, {**options, "parameter_overrides": own})
-    return from_mapping(cls, {name: value for name, value in given.items() if name in known})
+    values = _parameters(cls.GROUP, name, {**options, "parameter_overrides": overrides}, is_required=False)
+    return from_mapping(cls, {name: values[name] for name in values.keys() & names_of(cls)})
+
+
+def _parameters(kind: str, node: str, options: Mapping[str, Any], *, is_required: bool = True) -> dict[str, Any]:
+    """Return the parameters for a node of a kind and a full name, by name; what comes later counts."""
+    arguments = list(_flags(options.get("cli_args") or []))  # the node's own override the process's
+    if options.get("use_global_arguments", True):
+        context, default = options.get("context"), get_default_context()
+        # Those that the context was initialised with: as `init` saw them, else the process's own.
+        whole = _ARGUMENTS.get(context or default, sys.argv if context in (None, default) else [])
+        arguments = [*_flags(whole), *arguments]
+    values: dict[str, Any] = {}
+    for flag, value in arguments:
+        if flag == "--params-file":
+            for section in _sections_for(Path(value), kind, node, is_required):
+                values.update(section)
+        elif flag in ("-p", "--param"):
+            left, _, right = value.partition(":=")
+            owner, _, name = left.rpartition(":")
+            if owner in ("", kind, node.rpartition("/")[2]):
+                values[name] = parse_parameter_value(right)
+    return values | {override.name: plain_value(override) for override in options.get("parameter_overrides") or []}
 
 
 def _flags(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Give each argument between `--ros-args` and `--` with the one after it; rcl refuses what is broken."""
+    """Yield each argument between `--ros-args` and `--` with the one after it; rcl refuses what is broken."""
     is_ros = False
     for flag, value in zip(arguments, [*arguments[1:], ""], strict=False):
         if flag in ("--ros-args", "--"):
@@ -139,71 +155,32 @@ def _flags(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
             yield flag, value
 
 
-def _sections_for(path: Path, kind: str, node: str) -> list[tuple[str, dict[str, Any]]]:
+def _sections_for(path: Path, kind: str, node: str, is_required: bool) -> list[dict[str, Any]]:
     """Return the sections of a file that are for a node, by its own name or the one that it was given."""
-    sections, space = read_sections(path), node.rpartition("/")[0]
-    names = {node, f"{space}/{kind}"}
-    fitting = [(key, values) for key, values in sections if any(key_matches(key, name) for name in names)]
-    own = {key for key, _ in sections if node_of_key(key) in (kind, node_of_key(node))}
+    sections, (space, _, name) = read_sections(path), node.rpartition("/")
+    fitting = {key for key, _ in sections if key_matches(key, node) or key_matches(key, f"{space}/{kind}")}
+    of_kind = {key for key, _ in sections if key.rpartition("/")[2] in (kind, name)}
     # A section of its kind that is for another namespace only is as bad as none: the rest would be its defaults.
-    if not fitting or (own and not any(key in own for key, _ in fitting)):
-        expected = f"one for {node}: {EVERY_NODE}/{kind} or {node}" + ("" if own else f" or {EVERY_NODE}")
-        found = ", ".join(format_key(key) for key, _ in sections) or "none"
-        raise ConfigurationError("sections", found, expected, str(path))
-    return fitting
+    if is_required and (not fitting or (of_kind and not fitting & of_kind)):
+        expected = f"one for {node}: {EVERY_NODE}/{kind} or {node}" + ("" if of_kind else f" or {EVERY_NODE}")
+        keys = ", ".join(key for key, _ in sections) or "none"
+        raise ConfigurationError("sections", keys, expected, str(path))
+    return [values for key, values in sections if key in fitting]
 
 
-def declare(
-    node: Node,
-    cls: type[C],
-    given: Mapping[str, Any],
-    *,
-    read_only: bool = True,
-    fixed: Mapping[str, str] = MappingProxyType({}),
-) -> C:
-    """Declare every field of a configuration class and return the settings in force.
-
-    Shared parameters that the class does not know are meant for others, and left aside.
-
-    Args:
-        node: that gets the parameters.
-        cls: the configuration class.
-        given: values by name.
-        read_only: whether they stay as they are for good.
-        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; for their
-            descriptions.
-
-    Raises:
-        ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds.
-    """
-    fields = configuration_fields(cls)
-    others = set(SHARED_PARAMETERS) - {about.name for about in fields}
-    settings = from_mapping(cls, {name: value for name, value in given.items() if name not in others})
-    for name, value in to_mapping(settings).items():
-        about = next(field for field in fields if field.name == name)
-        descriptor = _descriptor(about, read_only, fixed.get(name))
-        if not isinstance(value, (list, tuple)) or len(value):
-            node.declare_parameter(name, value, descriptor, ignore_override=True)
-        else:  # by its value alone rclpy would take an empty list for one of bytes, for good
-            node.declare_parameter(name, _type(about), ParameterDescriptor(), ignore_override=True)
-            node.set_parameters([Parameter(name, _type(about), [])])
-            node.set_descriptor(name, descriptor)
-    return settings
-
-
-def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
-    quantity, constraints = about.quantity, about.quantity.expectation(about.kind)
+def _descriptor(setting: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
+    quantity, constraints = setting.quantity, setting.quantity.expectation(setting.kind, entry=setting.entry)
     if fixed is not None:
         constraints += "; stays while the node is configured" + (f": {fixed}" if fixed else "")
-    low, high = quantity.minimum, quantity.maximum
     ranges: dict[str, Any] = {}
-    if low is not None and high is not None and about.kind is float:
-        ranges["floating_point_range"] = [FloatingPointRange(from_value=float(low), to_value=float(high))]
-    elif low is not None and high is not None and about.kind is int:
-        ranges["integer_range"] = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    if setting.kind in (float, int) and math.isfinite(quantity.maximum):
+        limits = {"from_value": setting.kind(quantity.minimum), "to_value": setting.kind(quantity.maximum)}
+        if setting.kind is float:
+            ranges["floating_point_range"] = [FloatingPointRange(**limits)]
+        else:
+            ranges["integer_range"] = [IntegerRange(**limits, step=1)]
     return ParameterDescriptor(
-        name=about.name,
-        type=_type(about).value,
+        type=_type(setting).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
         additional_constraints=constraints,
         read_only=read_only,
@@ -211,38 +188,38 @@ def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -
     )
 
 
-def _type(about: ConfigurationField) -> Parameter.Type:
-    kinds = {float: Parameter.Type.DOUBLE, int: Parameter.Type.INTEGER, str: Parameter.Type.STRING}
-    if about.kind is tuple:
-        return Parameter.Type[f"{kinds[about.entry].name}_ARRAY"]
-    return Parameter.Type.BOOL if about.kind is bool else kinds[about.kind]
+def _type(setting: ConfigurationField) -> Parameter.Type:
+    is_list = setting.kind is tuple
+    return Parameter.Type[_TYPES[setting.entry if is_list else setting.kind] + "_ARRAY" * is_list]
 
 
-def as_declared(cls: type[C], parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Take whole numbers for real ones and any empty list for an empty one of its kind, as `declare` does.
+def _parameter(setting: ConfigurationField, value: Any) -> Parameter:
+    return Parameter(setting.name, _type(setting), list(value) if setting.kind is tuple else value)
 
-    `ros2 param load` sends an empty list as one of truth values, and 1e-05, a text for YAML 1.1, as a text.
 
-    Args:
-        cls: the configuration class whose fields are declared.
-        parameters: to be set.
+def _as_declared(node: Any, cls: type[Configuration], parameters: Sequence[Parameter]) -> list[Parameter]:
+    """Return parameters in the types of the fields: a whole number for a real one, any empty list for one of its kind.
+
+    `ros2 param load` sends an empty list as one of truth values, and 1e-05, a text for YAML 1.1, as a text. What is not
+    valid stays as it is, to be refused by its type or bounds.
+
+    Raises:
+        ParameterNotDeclaredException: an unknown name. The services of rclpy answer its text; by itself rclpy forgets
+            the name.
     """
-    fields = {about.name: about for about in configuration_fields(cls)}
-    return [_converted(fields.get(parameter.name), parameter) for parameter in parameters]
-
-
-def _converted(about: ConfigurationField | None, parameter: Parameter) -> Parameter:
-    if about is None:
-        return parameter
-    value, kind = plain_value(parameter), parameter.type_
-    if about.kind is tuple and value == []:
-        return Parameter(parameter.name, _type(about), [])
-    if about.kind is float and kind in (Parameter.Type.INTEGER, Parameter.Type.STRING):
-        with suppress(ValueError):  # no number: refused by its type
-            return Parameter(parameter.name, Parameter.Type.DOUBLE, float(value))
-    if _type(about) is Parameter.Type.DOUBLE_ARRAY and kind is Parameter.Type.INTEGER_ARRAY:
-        return Parameter(parameter.name, Parameter.Type.DOUBLE_ARRAY, [float(entry) for entry in value])
-    return parameter
+    fields = {setting.name: setting for setting in configuration_fields(cls)}
+    converted = []
+    for parameter in parameters:
+        name, value, setting = parameter.name, plain_value(parameter), fields.get(parameter.name)
+        if setting is None and not (name and node.has_parameter(name)):
+            expected = suggest_names(name, list(fields))
+            raise ParameterNotDeclaredException(str(ConfigurationError(f"{cls.GROUP}.{name}", value, expected)))
+        if setting is not None and value is not None:
+            text = isinstance(value, str) and setting.kind is float
+            with suppress(ConfigurationError):
+                parameter = _parameter(setting, setting.checked(parse_parameter_value(value) if text else value))
+        converted.append(parameter)
+    return converted
 
 
 def plain_value(parameter: Parameter) -> Any:

@@ -19,7 +19,7 @@ from magnetosuture_thread import ConfigurationError, InvalidInputError, Magnetos
 from magnetosuture_thread.bags.packing import camera_outputs, packed_image
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
-from magnetosuture_thread.nodes.parameters import declare, given_parameters
+from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
@@ -40,7 +40,7 @@ class RigSimulatorNode(GuardedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("rig_simulator", **options)
-        self._settings = settings = declare(self, RigSettings, given_parameters(self, "rig_simulator", options))
+        self._settings = settings = declare(self, RigSettings, options)
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         rate = settings.rate if self._simulated else 1.0

@@ -9,24 +9,23 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.needle_arc import check_needle, needle_chord
+from magnetosuture_thread.geometry.needle_arc import needle_chord
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_checks import WALL_NAME, find_collision
-from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, quantity
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PathFollowerSettings(Configuration):
+class PathFollowerSettings(shared.LifecycleSettings, shared.SceneName, shared.NeedleArc):
     """Path of the needle's tip, its speed and the controller gains."""
 
     GROUP: ClassVar[str] = "path_follower"
 
-    autostart: str = autostart_parameter()
     waypoints: tuple[float, ...] = quantity(
         (),
         "waypoints of the tip after its initial position: x and y of each, in the dish frame",
@@ -64,13 +63,6 @@ class PathFollowerSettings(Configuration):
         minimum=1e-5,
         maximum=0.1,
     )
-    scene: str = shared_parameter("scene")
-    needle_length: float = shared_parameter("needle_length")
-    needle_curvature: float = shared_parameter("needle_curvature")
-
-    def check(self) -> None:
-        """Reject a coiled needle."""
-        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
     def check_path(self, scene: Scene) -> None:
         """Reject a waypoint beyond the wall or inside a shape.

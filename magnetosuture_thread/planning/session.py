@@ -13,7 +13,6 @@ import numpy as np
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.planning.executor import (
@@ -29,27 +28,21 @@ from magnetosuture_thread.planning.executor import (
 from magnetosuture_thread.planning.path import BodyPath, body_clearance
 from magnetosuture_thread.planning.planner import NeedlePlanner, chains, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
-from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, quantity
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 NO_POSE = "no needle pose yet"
 
 
 @dataclass(frozen=True)
-class NeedlePlannerSettings(Configuration):
+class NeedlePlannerSettings(
+    shared.LifecycleSettings, shared.SceneName, shared.NeedleArc, shared.ThreadLength, shared.CommandFilter
+):
     """The needle, its clearance, and for how long what is known stays known."""
 
     GROUP: ClassVar[str] = "needle_planner"
 
-    autostart: str = autostart_parameter()
-    scene: str = shared_parameter("scene")
-    needle_length: float = shared_parameter("needle_length")
-    needle_curvature: float = shared_parameter("needle_curvature")
-    thread_length: float = shared_parameter("thread_length")
-    friction_feedback: str = shared_parameter("friction_feedback")
-    keep_out: float = shared_parameter("keep_out")
-    pose_margin: float = shared_parameter("pose_margin")
     pose_timeout: float = quantity(
         0.5,
         "a procedure pauses after this long without a needle pose; one that is older on arrival does not count",
@@ -92,10 +85,6 @@ class NeedlePlannerSettings(Configuration):
     audience: int = quantity(
         1, "subscribers to its commands that it waits for: the bridge, and any recorder", minimum=1, maximum=100
     )
-
-    def check(self) -> None:
-        """Reject a coiled needle."""
-        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
     def planner(
         self, scene: Scene, coils: CoilBridgeSettings | None = None, model: ThreadModelSettings | None = None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene
@@ -22,13 +22,15 @@ from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
 from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.rig.power import StageProcess
-from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
-class RigSettings(Configuration):
+class RigSettings(
+    shared.SceneName, shared.Viscosity, shared.CoilDrivers, shared.NeedleArc, shared.NeedleWidth, shared.ThreadLength
+):
     """The rig that is simulated: its scene, coils, needle, thread and camera, and what goes wrong.
 
     These are the truth of the simulation. What the other nodes believe is in their own sections.
@@ -44,13 +46,10 @@ class RigSettings(Configuration):
         (), "what goes wrong: KIND START DURATION each, in seconds since the first current"
     )
 
-    scene: str = shared_parameter("scene")
-    viscosity: float = shared_parameter("viscosity")
     obstacle_looks: tuple[str, ...] = quantity(
         (), f"of what each shape of the scene seems to be made, in order: {', '.join(LOOKS)}; none given: by its kind"
     )
 
-    coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
     coil_distance: float = quantity(
         0.05, "from the dish's centre to the middle of a coil", unit="m", minimum=0.01, maximum=1.0
     )
@@ -60,7 +59,6 @@ class RigSettings(Configuration):
     coil_max_current: float = quantity(
         30.0, "that the power stage gives, in either direction", unit="A", minimum=0.01, maximum=1000.0
     )
-    driver_timeout: float = shared_parameter("driver_timeout")
 
     power_stage: str = quantity(
         "topic",
@@ -74,9 +72,6 @@ class RigSettings(Configuration):
     coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
     supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
 
-    needle_length: float = shared_parameter("needle_length")
-    needle_width: float = shared_parameter("needle_width")
-    needle_curvature: float = shared_parameter("needle_curvature")
     needle_magnetisation: float = quantity(
         1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
     )
@@ -88,7 +83,6 @@ class RigSettings(Configuration):
         multiple=3,
     )
 
-    thread_length: float = shared_parameter("thread_length")
     thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
     thread_segments: int = quantity(60, "that the simulated thread is cut into", minimum=8, maximum=400)
     thread_attachment: str = quantity("pinned", "to the needle", choices=("pinned", "clamped"))
@@ -132,7 +126,6 @@ class RigSettings(Configuration):
             raise self.refused("needle_length", "at least two widths [m]")
         if self.thread_diameter >= self.thread_length:
             raise self.refused("thread_diameter", "less than its length [m]")
-        check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         for fault in self.faults:
             Fault.parse(fault)
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import get_type_hints
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.console.settings import ConsoleSettings
@@ -16,22 +17,12 @@ from magnetosuture_thread.planning.follower import PathFollowerSettings
 from magnetosuture_thread.planning.procedure import Procedure
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.rig.settings import RigSettings
-from magnetosuture_thread.settings.configuration import Configuration
+from magnetosuture_thread.settings.configuration import Configuration, errors_of_file
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.parameter_files import EVERY_NODE, load_setup
 from magnetosuture_thread.settings.resources import find_setup_file
 from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-
-SETTINGS_CLASSES = (
-    VisionTrackerSettings,
-    ThreadModelSettings,
-    CoilBridgeSettings,
-    RigSettings,
-    PathFollowerSettings,
-    NeedlePlannerSettings,
-    ConsoleSettings,
-)
 
 
 @dataclass(frozen=True)
@@ -66,11 +57,6 @@ class Setup:
         other.__dict__["scene"] = scene  # where the cached property looks first
         return other
 
-    @property
-    def has_scene(self) -> bool:
-        """Whether the setup names a scene."""
-        return bool(self.model.scene)
-
     @cached_property
     def scene(self) -> Scene:
         """The scene that all nodes start from.
@@ -78,28 +64,27 @@ class Setup:
         Raises:
             ConfigurationError: the setup names none, or its file cannot be used.
         """
-        if not self.has_scene:
+        if not self.model.scene:
             raise ConfigurationError("scene", "none", f"a scene file under {EVERY_NODE}", str(self.path))
-        try:
+        with errors_of_file(str(self.path)):
             return read_scene(self.model.scene)
-        except ConfigurationError as error:
-            if error.source:
-                raise
-            raise ConfigurationError(error.name, error.value, error.expectation, str(self.path)) from None
 
 
-def _check_agreement(path: Path, settings: Mapping[str, Configuration]) -> None:
+SETTINGS_CLASSES: tuple[type[Configuration], ...] = tuple(
+    kind for kind in get_type_hints(Setup).values() if issubclass(kind, Configuration)
+)
+
+
+def _check_agreement(settings: Mapping[str, Configuration]) -> None:
     """Refuse two values of one shared parameter, as of `/**` and of a node's section; the rig's are the truth."""
-    first: dict[str, tuple[str, object]] = {}
-    for group, values in settings.items():
-        if group == RigSettings.GROUP:
-            continue
-        for name in SHARED_PARAMETERS:
-            if hasattr(values, name):
-                owner, expected = first.setdefault(name, (group, getattr(values, name)))
-                if getattr(values, name) != expected:
-                    words = f"{expected!r}, as {owner}.{name}; what nodes share is written once, under {EVERY_NODE}"
-                    raise ConfigurationError(f"{group}.{name}", getattr(values, name), words, str(path))
+    for name in SHARED_PARAMETERS:
+        values = {group: getattr(node, name) for group, node in settings.items() if hasattr(node, name)}
+        values.pop(RigSettings.GROUP, None)
+        owner, *others = values
+        for group in others:
+            if values[group] != values[owner]:
+                words = f"{values[owner]!r}, as {owner}.{name}; what nodes share is written once, under {EVERY_NODE}"
+                raise ConfigurationError(f"{group}.{name}", values[group], words)
 
 
 def read_setup(name: str, scene: Scene | None = None) -> Setup:
@@ -114,15 +99,13 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
     """
     path = find_setup_file(name)
     settings = load_setup(path, (*SETTINGS_CLASSES, SceneServerSettings))
-    _check_agreement(path, settings)
-    setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
-    if scene is not None:  # as of a bag, of which no path is followed
-        return setup.with_scene(scene)
-    if setup.has_scene:
-        try:
+    with errors_of_file(str(path)):
+        _check_agreement(settings)
+        setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
+        if scene is not None:  # as of a bag, of which no path is followed
+            return setup.with_scene(scene)
+        if setup.model.scene:
             setup.follower.check_path(setup.scene)
-        except ConfigurationError as error:
-            raise ConfigurationError(error.name, error.value, error.expectation, str(path)) from None
     return setup
 
 

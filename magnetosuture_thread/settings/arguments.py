@@ -16,9 +16,9 @@ T = TypeVar("T")
 WORDS: dict[type, str] = {bool: "true or false", NoneType: "nothing"}
 
 
-def bounded(unit: str = "", minimum: float | None = None, maximum: float | None = None, **more: Any) -> Quantity:
-    """Return the quantity of an argument, with which its type is annotated, as in `Annotated[float, LENGTH]`."""
-    return Quantity("", unit, minimum, maximum, **more)
+def bounded(*arguments: Any, **options: Any) -> Quantity:
+    """Return a quantity without a description, to annotate an argument's type, as in `Annotated[float, LENGTH]`."""
+    return Quantity("", *arguments, **options)
 
 
 def checked_arguments(owner: str, kind: Callable[..., Exception] = ConfigurationError) -> Callable[[T], T]:
@@ -39,15 +39,15 @@ def checked_arguments(owner: str, kind: Callable[..., Exception] = Configuration
 
         @wraps(function)
         def checked(*args: Any, **kwargs: Any) -> Any:
-            given = signature.bind(*args, **kwargs)
+            bound = signature.bind(*args, **kwargs)
             try:
-                for name, value in given.arguments.items():
+                for name, value in bound.arguments.items():
                     hint = hints().get(name)
                     if hint is not None and (value is not None or signature.parameters[name].default is not None):
-                        given.arguments[name] = _checked_argument(f"{owner}.{name}", value, hint)
+                        bound.arguments[name] = _checked_argument(f"{owner}.{name}", value, hint)
             except ConfigurationError as error:
                 raise kind(error.name, error.value, error.expectation) from None
-            return function(*given.args, **given.kwargs)
+            return function(*bound.args, **bound.kwargs)
 
         if function is target:
             return checked
@@ -59,14 +59,14 @@ def checked_arguments(owner: str, kind: Callable[..., Exception] = Configuration
 
 def _checked_argument(name: str, value: Any, hint: Any) -> Any:
     """Return an argument as its annotation has it; what is neither class nor number is not, nor an array."""
-    hint, about = (hint.__origin__, hint.__metadata__[0]) if get_origin(hint) is Annotated else (hint, Quantity(""))
+    hint, quantity = get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, Quantity(""))
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     lists = [kind for kind in kinds if {int, float} & {*get_args(kind)}]
     if lists or {int, float} & {*kinds}:
         value = value.tolist() if hasattr(value, "tolist") else value
         if lists and not (len(kinds) > 1 and isinstance(value, (int, float))):
-            return about.checked(name, value, tuple, get_args(lists[0])[0])
-        return about.checked(name, value, int if int in kinds else float)
+            return quantity.checked(name, value, tuple, get_args(lists[0])[0])
+        return quantity.checked(name, value, int if int in kinds else float)
     classes = [Sequence if get_origin(kind) is tuple else get_origin(kind) or kind for kind in kinds]
     if all(isinstance(kind, type) and not hasattr(kind, "__array__") for kind in classes):
         if not isinstance(value, tuple(classes)) or (isinstance(value, str) and str not in classes):

@@ -1,7 +1,11 @@
-"""Configuration classes: frozen dataclasses with unit, bounds and description of each field.
+"""Configuration classes: frozen dataclasses with default, unit, bounds and one sentence for each field.
 
 Validation of YAML files, the parameters that a node declares, and their descriptions are derived from the class.
 Values are checked when the object is created, so every object is valid.
+
+The standard library's dataclasses carry this. attrs has nothing more that would be used here; msgspec checks what it
+decodes, not what is constructed; pydantic 2 adds 0.1 s to the start of every node, and Ubuntu 24.04 has pydantic 1.10.
+None of them refuses a number by its unit, so the check itself is ours with each.
 """
 
 from __future__ import annotations
@@ -9,21 +13,24 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast, get_type_hints
+from typing import Any, ClassVar, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
-from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import MAX_NAME_CHARS, ConfigurationError
 from magnetosuture_thread.settings.files import read_regular
 from magnetosuture_thread.settings.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
 
 C = TypeVar("C", bound="Configuration")
 
 
+MAX_SUGGESTIONS = 20  # names in an error, which is one line
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
 
@@ -35,8 +42,8 @@ class Quantity:
     Attributes:
         description: one sentence for a person.
         unit: SI unit, empty for text and switches.
-        minimum: minimum value accepted, also of each entry of a list.
-        maximum: maximum value accepted, also of each entry of a list.
+        minimum: minimum value accepted, also of each entry of a list; -inf for any.
+        maximum: maximum value accepted, likewise.
         choices: the texts accepted, also in a list; empty for any.
         multiple: a list's length must be a multiple of this.
         unlimited: whether inf is accepted too, as no limit.
@@ -44,26 +51,29 @@ class Quantity:
 
     description: str
     unit: str = ""
-    minimum: float | None = None
-    maximum: float | None = None
-    choices: tuple[str, ...] = ()
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    choices: Sequence[str] = ()
     multiple: int = 1
     unlimited: bool = False
 
-    def expectation(self, kind: type, value: Any = None) -> str:
+    @property
+    def bounds(self) -> str:
+        """The bounds as text, empty without any."""
+        if math.isfinite(self.maximum):
+            return f"from {self.minimum:g} to {self.maximum:g}"
+        return f"of at least {self.minimum:g}" if math.isfinite(self.minimum) else ""
+
+    def expectation(self, kind: type, value: Any = None, entry: type = float) -> str:
         """Return the accepted values as text, with a hint where a thousandth of the value given would be accepted."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
-        words = {float: "a number", int: "a whole number", bool: "true or false", str: "text", tuple: "a list"}[kind]
-        if kind is tuple and self.multiple > 1:
-            words += f" of a multiple of {self.multiple} numbers"
-        if self.minimum is not None and self.maximum is not None:
-            words += f" from {self.minimum:g} to {self.maximum:g}"
-        elif self.minimum is not None:
-            words += f" of at least {self.minimum:g}"
-        elif self.maximum is not None:
-            words += f" of at most {self.maximum:g}"
-        return f"{words} {self.unit}".rstrip() + (", or inf" if self.unlimited else "") + self.hint(value)
+        lists = {int: "a list of whole numbers", str: "a list of texts"}
+        words = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
+        text = lists.get(entry, "a list") if kind is tuple else words[kind]
+        several = f"of a multiple of {self.multiple} numbers" if kind is tuple and self.multiple > 1 else ""
+        text = " ".join(part for part in (text, several, self.bounds, self.unit) if part)
+        return text + (", or inf" if self.unlimited else "") + self.hint(value)
 
     def hint(self, value: Any) -> str:
         """Return a question for a length or a speed of which a thousandth would be accepted; empty for another."""
@@ -73,7 +83,7 @@ class Quantity:
         asks = self.unit.split("/")[0] == "m" and wrong and scaled
         return f"; given in {'metres' if self.unit == 'm' else self.unit}?" if asks else ""
 
-    def checked(self, name: str, value: Any, kind: type = float, entry: type = float, source: str = "") -> Any:
+    def checked(self, name: str, value: Any, kind: type = float, entry: type = float) -> Any:
         """Return a value in its type.
 
         Args:
@@ -81,19 +91,15 @@ class Quantity:
             value: as it was given.
             kind: float, int, bool, str, or tuple for a list.
             entry: type of each entry of a list.
-            source: file that it is from, for the error.
 
         Raises:
             ConfigurationError: it is of another type, or out of bounds.
         """
         entries = value if kind is tuple else [value]
-        good = isinstance(entries, Sequence) and not isinstance(entries, str) and len(entries) % self.multiple == 0
-        if not (good and all(self._fits(each, entry if kind is tuple else kind) for each in entries)):
-            of = {int: "a list of whole numbers", str: "a list of texts"}.get(entry, "a list")
-            raise ConfigurationError(name, value, self.expectation(kind, value).replace("a list", of), source)
-        if kind is tuple:
-            return tuple(entry(each) for each in value)
-        return float(value) if kind is float else value
+        is_list = isinstance(entries, Sequence) and not isinstance(entries, str) and len(entries) % self.multiple == 0
+        if not is_list or not all(self._fits(part, entry if kind is tuple else kind) for part in entries):
+            raise ConfigurationError(name, value, self.expectation(kind, value, entry))
+        return tuple(map(entry, value)) if kind is tuple else kind(value)
 
     def _fits(self, value: Any, kind: type) -> bool:
         """Return whether a value, or an entry of a list, is of a kind and accepted."""
@@ -103,51 +109,33 @@ class Quantity:
 
     def within(self, number: Any) -> bool:
         """Return whether something is a number, finite and within the bounds."""
-        try:
-            value = float(number) if _is_number(number) else math.nan
-        except OverflowError:  # a whole number beyond any float
+        if not _is_number(number):
             return False
-        if self.unlimited and value == math.inf:
-            return True
-        low, high = self.minimum, self.maximum
-        return math.isfinite(value) and (low is None or value >= low) and (high is None or value <= high)
+        finite = abs(number) <= sys.float_info.max  # not nan, and no whole number beyond any float
+        return (finite and self.minimum <= number <= self.maximum) or (self.unlimited and number == math.inf)
 
 
-def quantity(
-    default: Any,
-    description: str,
-    unit: str = "",
-    minimum: float | None = None,
-    maximum: float | None = None,
-    *,
-    choices: Sequence[str] = (),
-    multiple: int = 1,
-) -> Any:
-    """Make a dataclass field that carries a `Quantity`."""
-    about = Quantity(description, unit, minimum, maximum, tuple(choices), multiple)
-    return field(default=default, metadata={"quantity": about})
-
-
-def autostart_parameter() -> Any:
-    """Return the dataclass field of a lifecycle node's parameter `autostart`."""
-    states = ("unconfigured", "inactive", "active")
-    return quantity("active", "state that the node enters by itself at start", choices=states)
+def quantity(default: Any, *arguments: Any, **options: Any) -> Any:
+    """Return a dataclass field with a default and a `Quantity`, which is made of the other arguments."""
+    return field(default=default, metadata={"quantity": Quantity(*arguments, **options)})
 
 
 class Configuration:
     """Base of the configuration dataclasses: checks every field when an object is made.
 
-    A subclass is a frozen dataclass with a `GROUP`, the name of its section in a setup file, and all
-    of whose fields are made by `quantity`. It checks what concerns several fields in `check`.
+    A subclass is a frozen dataclass with a `GROUP`, the name of its section in a setup file, and all of whose fields
+    are made by `quantity`. It checks what concerns several fields in `check`; those of its bases are called too.
     """
 
     GROUP: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         """Check every field by its quantity, then the fields together."""
-        for about in configuration_fields(type(self)):
-            object.__setattr__(self, about.name, about.checked(getattr(self, about.name)))
-        self.check()
+        for setting in configuration_fields(type(self)):
+            object.__setattr__(self, setting.name, setting.checked(getattr(self, setting.name)))
+        for cls in reversed(type(self).__mro__):
+            if "check" in vars(cls):
+                cls.check(self)  # type: ignore[attr-defined]
 
     def check(self) -> None:
         """Raise `ConfigurationError` where fields that are valid apart contradict each other."""
@@ -167,11 +155,11 @@ class ConfigurationField:
     kind: type
     default: Any
     quantity: Quantity
-    entry: type = float  # of each entry of a list
+    entry: type  # of each entry of a list
 
-    def checked(self, value: Any, source: str = "") -> Any:
+    def checked(self, value: Any) -> Any:
         """Return the value in the field's type, or raise `ConfigurationError`."""
-        return self.quantity.checked(f"{self.group}.{self.name}", value, self.kind, self.entry, source)
+        return self.quantity.checked(f"{self.group}.{self.name}", value, self.kind, self.entry)
 
 
 def _is_number(value: Any) -> bool:
@@ -179,19 +167,28 @@ def _is_number(value: Any) -> bool:
 
 
 def _read_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
-    hints, found = get_type_hints(cls), []
-    for entry in fields(cast(Any, cls)):
+    hints = get_type_hints(cls)
+
+    def read(entry: Any) -> ConfigurationField:
         hint = hints[entry.name]
-        kind, entries = getattr(hint, "__origin__", hint), getattr(hint, "__args__", (float,))[0]
-        assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"
-        about = entry.metadata["quantity"]
-        found.append(ConfigurationField(cls.GROUP, entry.name, kind, entry.default, about, entries))
-    return tuple(found)
+        kind, entries = get_origin(hint) or hint, get_args(hint) or (float,)
+        return ConfigurationField(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"], entries[0])
+
+    return tuple(map(read, fields(cast(Any, cls))))
 
 
 # To read type hints takes longer than to check a value.
 configuration_fields = cast("Callable[[type[Configuration]], tuple[ConfigurationField, ...]]", cache(_read_fields))
 """Return the fields of a configuration class."""
+
+
+@contextmanager
+def errors_of_file(source: str) -> Iterator[None]:
+    """Name a file in every `ConfigurationError` that names none yet."""
+    try:
+        yield
+    except ConfigurationError as error:
+        raise ConfigurationError(error.name, error.value, error.expectation, error.source or source) from None
 
 
 def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C:
@@ -205,21 +202,17 @@ def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C
     Raises:
         ConfigurationError: a key is unknown, or a value is of the wrong type or out of its bounds.
     """
-    about = {entry.name: entry for entry in configuration_fields(cls)}
-    checked = {}
-    for name, value in values.items():
-        if name not in about:
-            raise ConfigurationError(f"{cls.GROUP}.{name}", value, suggest_names(name, list(about)), source)
-        checked[name] = about[name].checked(value, source)
-    try:
-        return cls(**checked)
-    except ConfigurationError as error:
-        raise ConfigurationError(error.name, error.value, error.expectation, source) from None
+    known = [setting.name for setting in configuration_fields(cls)]
+    with errors_of_file(source):
+        for name, value in values.items():
+            if name not in known:
+                raise ConfigurationError(f"{cls.GROUP}.{name}", value, suggest_names(name, known))
+        return cls(**values)
 
 
 def to_mapping(settings: Configuration) -> dict[str, Any]:
     """Return a configuration object's values by field name, tuples as lists."""
-    values = {about.name: getattr(settings, about.name) for about in configuration_fields(type(settings))}
+    values = {setting.name: getattr(settings, setting.name) for setting in configuration_fields(type(settings))}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
@@ -240,22 +233,12 @@ class _RosLoader(yaml.CSafeLoader):  # the loader without libyaml takes ten time
         return mapping
 
 
-def use_ros_numbers(loader: type[Any]) -> None:
-    """Make a YAML loader, a class, read numbers as ROS does: 1e-5 is a number, and nothing is a date."""
-    loader.yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
-        for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
-    number = r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
-    loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), list("-+0123456789."))
-
-
-use_ros_numbers(_RosLoader)
-
-
-def _load(text: str, *, plain: bool = False) -> Any:
-    check_yaml(text, plain=plain)
-    return yaml.load(text, _RosLoader)
+_RosLoader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
+    for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_NUMBER = r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
+_RosLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(_NUMBER), list("-+0123456789."))
 
 
 def read_yaml(path: Path, what: str, *, plain: bool = False) -> Any:
@@ -292,7 +275,8 @@ def read_yaml_text(text: str, what: str, source: str = "", *, plain: bool = Fals
     if len(text) > MAX_TEXT_BYTES:
         raise ConfigurationError(what, f"{len(text)} characters", f"at most {MAX_TEXT_BYTES}", source)
     try:
-        return _load(text, plain=plain)
+        check_yaml(text, plain=plain)
+        return yaml.load(text, _RosLoader)
     except BudgetError as error:
         raise ConfigurationError(what, str(error), f"plain YAML, at most {MAX_YAML_DEPTH} deep", source) from None
     except yaml.YAMLError as error:
@@ -306,14 +290,16 @@ def read_yaml_text(text: str, what: str, source: str = "", *, plain: bool = Fals
 
 def parse_parameter_value(text: str) -> Any:
     """Return the value of a text as in a parameter file; the text itself where it is no YAML."""
-    try:
-        return _load(text)
-    except (yaml.YAMLError, BudgetError):
-        return text
+    with suppress(ConfigurationError):
+        return read_yaml_text(text, "parameter")
+    return text
 
 
-def suggest_names(name: str, known: list[str]) -> str:
-    """Return the known names as text, with the closest match as a hint."""
+def suggest_names(name: str, known: Sequence[str]) -> str:
+    """Return known names as text, the most similar ones of many, with the closest match as a hint."""
+    name = name[:MAX_NAME_CHARS]  # to compare long texts takes long
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
-    return f"one of {', '.join(known)}{hint}"
+    similar = difflib.get_close_matches(name, known, n=MAX_SUGGESTIONS, cutoff=0.0)
+    shown = known if len(known) <= MAX_SUGGESTIONS else [*similar, "…"]
+    return f"one of {', '.join(shown)}{hint}"

@@ -16,6 +16,7 @@ from magnetosuture_thread.settings.configuration import (
     ROS_PARAMETERS,
     Configuration,
     configuration_fields,
+    errors_of_file,
     from_mapping,
     read_yaml,
     suggest_names,
@@ -43,8 +44,8 @@ def read_sections(path: Path, what: str = "parameter file") -> list[tuple[str, d
     content = read_yaml(path, what)
     if not isinstance(content, Mapping):
         # What the file holds is not shown: it may be none of ours.
-        found = None if content is None else f"content of type {type(content).__name__}"
-        raise ConfigurationError(what, found, f"sections by node, each with {PARAMETERS}", str(path))
+        shown = None if content is None else f"content of type {type(content).__name__}"
+        raise ConfigurationError(what, shown, f"sections by node, each with {PARAMETERS}", str(path))
     return list(_sections("", content, str(path)))
 
 
@@ -52,16 +53,20 @@ def _sections(above: str, content: Mapping[str, Any], source: str) -> Iterable[t
     for name, section in content.items():
         key = f"{above}/{str(name).strip('/')}"
         if not isinstance(section, Mapping) or not section:
-            raise ConfigurationError(format_key(key), section, f"one key, {PARAMETERS}", source)
+            raise ConfigurationError(key, section, f"one key, {PARAMETERS}", source)
         if PARAMETERS not in section:
             yield from _sections(key, section, source)
             continue
         values = section[PARAMETERS]
         if len(section) > 1:
-            raise ConfigurationError(format_key(key), list(section), f"one key, {PARAMETERS}", source)
+            raise ConfigurationError(key, list(section), f"one key, {PARAMETERS}", source)
         if not isinstance(values, Mapping):
-            raise ConfigurationError(f"{format_key(key)}.{PARAMETERS}", values, "parameters by name", source)
-        yield key, {str(name): value for name, value in values.items()}
+            raise ConfigurationError(f"{key}.{PARAMETERS}", values, "parameters by name", source)
+        for parameter, value in values.items():
+            if isinstance(value, list) and len({type(entry) for entry in value}) > 1:  # ROS takes no such file
+                at = f"{key}.{parameter}"
+                raise ConfigurationError(at, value, "entries of one kind: 0.0, not 0", source)
+        yield key, {str(parameter): value for parameter, value in values.items()}
 
 
 def key_matches(key: str, node: str) -> bool:
@@ -79,11 +84,6 @@ def key_matches(key: str, node: str) -> bool:
     return re.fullmatch(pattern, node) is not None
 
 
-def node_of_key(key: str) -> str:
-    """Return the name of the node that a section's key ends in, which may be a wildcard."""
-    return key.rpartition("/")[2]
-
-
 def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
     """Read a setup: a ROS 2 parameter file with shared parameters under `/**` and a section for each node.
 
@@ -98,47 +98,29 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
         ConfigurationError: the file cannot be read, is no parameter file, or holds anything invalid.
     """
     known = {cls.GROUP: cls for cls in classes}
-    fields = {group: {about.name for about in configuration_fields(cls)} for group, cls in known.items()}
-    given: dict[str, dict[str, Any]] = {group: {} for group in known}
-    spaces: list[str] = []
-    for key, section in read_sections(path, "setup file"):
-        values = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
-        group = node_of_key(key)
-        for name, value in values.items():
-            check_list_value(f"{format_key(key)}.{name}", value, str(path))
-        if key == EVERY_NODE:
-            for name, value in values.items():
-                if name not in SHARED_PARAMETERS:
-                    known_shared = suggest_names(name, list(SHARED_PARAMETERS))
-                    expected = f"a shared parameter, {known_shared}; others in their node's section"
-                    raise ConfigurationError(f"{EVERY_NODE}.{name}", value, expected, str(path))
-                for owner in known:
-                    if name in fields[owner]:
-                        given[owner][name] = value
-            continue
-        if group not in known:
-            raise ConfigurationError(format_key(key), group, suggest_names(group, [EVERY_NODE, *known]), str(path))
-        space = key.rpartition("/")[0]
-        if space and "*" not in space:
-            spaces.append(space)
-        if len(set(spaces)) > 1:
-            raise ConfigurationError(
-                format_key(key), space, f"one namespace in a setup, as {spaces[0]} before", str(path)
-            )
-        given[group].update(values)
-    return {group: from_mapping(cls, given[group], str(path)) for group, cls in known.items()}
+    values: dict[str, dict[str, Any]] = {group: {} for group in known}
+    space = ""
+    with errors_of_file(str(path)):
+        for key, section in read_sections(path, "setup file"):
+            above, _, group = key.rpartition("/")
+            section = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
+            if key == EVERY_NODE:
+                for name in section:
+                    if name not in SHARED_PARAMETERS:
+                        expected = f"a shared parameter, {suggest_names(name, SHARED_PARAMETERS)}"
+                        expected += "; others in their node's section"
+                        raise ConfigurationError(f"{EVERY_NODE}.{name}", section[name], expected)
+                for group, cls in known.items():
+                    values[group].update((name, section[name]) for name in section.keys() & names_of(cls))
+                continue
+            if group not in known:
+                raise ConfigurationError(key, group, suggest_names(group, [EVERY_NODE, *known]))
+            if above and "*" not in above and above != (space := space or above):
+                raise ConfigurationError(key, above, f"one namespace in a setup, as {space} before")
+            values[group].update(section)
+        return {group: from_mapping(cls, values[group]) for group, cls in known.items()}
 
 
-def format_key(key: str) -> str:
-    """Return a key for an error text: a single name without its slash."""
-    return key[1:] if key.count("/") == 1 and "*" not in key else key
-
-
-def check_list_value(name: str, value: Any, source: str) -> None:
-    """Refuse a list that is not valid in ROS; an empty one is, and is what a dump of parameters holds.
-
-    Raises:
-        ConfigurationError: its entries are of several kinds.
-    """
-    if isinstance(value, list) and len({type(entry) for entry in value}) > 1:
-        raise ConfigurationError(name, value, "entries of one kind: 0.0, not 0", source)
+def names_of(cls: type[Configuration]) -> set[str]:
+    """Return the names of the parameters of a configuration class."""
+    return {setting.name for setting in configuration_fields(cls)}

@@ -22,6 +22,8 @@ DIAMETER = bounded("m", 1e-6, 0.01)
 VISCOSITY = bounded("Pa s", 1e-6, 1e4)
 DRAG = bounded("Pa s", 0.0, 1e6)
 SHARE = bounded("", 1e-3, 1.0)
+MIN_ELASTIC_MODULUS = 1e6  # Pa; of silicone rubber, softer than any suture material
+MAX_ELASTIC_MODULUS = 1e12  # Pa; of diamond, stiffer than any wire
 MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
@@ -110,7 +112,7 @@ class Material:
 
     name: str
     diameter: Annotated[float, DIAMETER]
-    elastic_modulus: Annotated[float, bounded("Pa", 0.0, 1e12)]
+    elastic_modulus: Annotated[float, bounded("Pa", MIN_ELASTIC_MODULUS, MAX_ELASTIC_MODULUS)]
     source: str
     stiffness_weight: Annotated[float, bounded("", 0.0, 1e12)] = 1.0
 

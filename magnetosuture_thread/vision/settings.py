@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, quantity
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 MIN_SCALE = 1e-7  # m; of a pixel: finer than light resolves
 MIN_SIDE_PX = 64  # of a frame that is looked at
@@ -19,17 +19,14 @@ WORKING_NEEDLE_PX = 5.0  # width of the needle in a frame that is measured on; m
 
 
 @dataclass(frozen=True)
-class VisionTrackerSettings(Configuration):
+class VisionTrackerSettings(
+    shared.LifecycleSettings, shared.SceneName, shared.NeedleLength, shared.NeedleWidth, shared.ThreadLength
+):
     """What the vision tracker must know of the scene, the needle and the camera."""
 
     GROUP: ClassVar[str] = "vision_tracker"
 
-    autostart: str = autostart_parameter()
     image_transport: str = quantity("compressed", "which camera topic to take", choices=("raw", "compressed"))
-    scene: str = shared_parameter("scene")
-    needle_length: float = shared_parameter("needle_length")
-    needle_width: float = shared_parameter("needle_width")
-    thread_length: float = shared_parameter("thread_length")
     region_px: tuple[float, ...] = quantity(
         (),
         "part of the frame that is looked at: left, top, right, bottom; not given: all of it",

@@ -77,7 +77,7 @@ def test_the_file_is_what_thread_model_loads(tmp_path: Path):
     settings = load_setup(path, [ThreadModelSettings])["thread_model"]
     assert isinstance(settings, ThreadModelSettings)
     assert stiffness_over_drag(settings) == pytest.approx(2e-9, rel=1e-5)
-    assert replace(settings, elastic_modulus=1.0) == replace(FOUND.settings, elastic_modulus=1.0)
+    assert replace(settings, elastic_modulus=1e9) == replace(FOUND.settings, elastic_modulus=1e9)
     for words in (
         "# drag anisotropy is left out, as this data cannot tell it: too wide to be of use",
         "# offset left stays 0 m, as this data cannot tell it: too little to be seen",

@@ -45,11 +45,9 @@ def test_scene_too_narrow_for_the_needle_is_rejected():
         ({"calibration": "nowhere.yaml"}, r"coil_bridge\.calibration, nowhere\.yaml: coil calibration: .*No such file"),
         ({"calibration": "~nobody_of_this_name/rig.yaml"}, r"coil_bridge\.calibration"),
         ({"autostart": "armed", "driver": "roboclaw"}, "coil_bridge"),
-        ({"without_prediction": "go on"}, r"coil_bridge\.without_prediction"),
         ({"command_timeout": 0.015}, r"coil_bridge\.command_timeout"),
         ({"rate": 10.0}, "4 periods of the loop"),
         ({"roboclaw_answer_timeout": 0.02}, r"coil_bridge\.roboclaw_answer_timeout"),
-        ({"roboclaw_answer_timeout": 1.5}, r"coil_bridge\.roboclaw_answer_timeout"),
     ],
 )
 def test_what_does_not_fit_together_is_refused(change: dict, words: str):

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis, needle_points
+from magnetosuture_thread.geometry.needle_arc import needle_axis, needle_points
 from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.shared_parameters import check_needle
 
 LENGTH = 0.007
 

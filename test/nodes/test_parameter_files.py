@@ -30,9 +30,7 @@ def domain() -> Iterator[int]:
 def followed(tmp_path: Path, domain: int):
     """Makes a follower of the texts of files and of arguments; returns its name, speed and needle length."""
 
-    def make(
-        texts: Sequence[str], arguments: Sequence[str] = (), own: Sequence[str] = (), namespace: str = ""
-    ) -> tuple[str, float, float]:
+    def make(texts: Sequence[str], arguments: Sequence[str] = ()) -> tuple[str, float, float]:
         files = [tmp_path / f"{index}.yaml" for index in range(len(texts))]
         for file, text in zip(files, texts, strict=True):
             file.write_text(text)
@@ -40,8 +38,7 @@ def followed(tmp_path: Path, domain: int):
         context, node = Context(), None
         try:
             init(["program", "--ros-args", *given, *arguments], context)
-            cli_args = ["--ros-args", *own] if own else None
-            node = PathFollowerNode(context=context, cli_args=cli_args, namespace=namespace)
+            node = PathFollowerNode(context=context)
             speed, length = (float(node.get_parameter(name).value) for name in ("speed", "needle_length"))
             return node.get_fully_qualified_name(), speed, length
         finally:
@@ -53,60 +50,41 @@ def followed(tmp_path: Path, domain: int):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "name"),
+    ("texts", "arguments", "name", "speed"),
     [
-        ((), "/path_follower"),
-        (LAB1, "/lab1/path_follower"),
-        ((*LAB1, *LEFT), "/lab1/left_follower"),
-        (("-r", "path_follower:__node:=left_follower", "--remap", "__ns:=/a/b"), "/a/b/left_follower"),
-        (("-r", "other:__node:=left_follower"), "/path_follower"),
+        # A setup applies in any namespace and under any name.
+        ([COMMON + OWN], (), "/path_follower", 0.004),
+        ([COMMON, OWN], (*LAB1, *LEFT), "/lab1/left_follower", 0.004),
+        ([COMMON + OWN], ("-r", "path_follower:__node:=left", "--remap", "__ns:=/a/b"), "/a/b/left", 0.004),
+        # A renamed node takes the section of its kind and that of its name.
+        ([COMMON + OWN + "/left_follower: {ros__parameters: {speed: 0.002}}"], LEFT, "/left_follower", 0.002),
+        ([COMMON + "/left_follower: {ros__parameters: {speed: 0.002}}\n" + OWN], LEFT, "/left_follower", 0.004),
+        # What comes later counts; rcl merges all by key, and would take 0.004 in the first four.
+        ([COMMON + OWN], ("-p", "speed:=0.003"), "/path_follower", 0.003),
+        ([COMMON + OWN, "/**: {ros__parameters: {speed: 0.003}}"], (), "/path_follower", 0.003),
+        ([COMMON + OWN], (*LAB1, "-p", "path_follower:speed:=0.003"), "/lab1/path_follower", 0.003),
+        ([COMMON + OWN], (*LEFT, "--param", "left_follower:speed:=0.003"), "/left_follower", 0.003),
+        ([COMMON + OWN], ("-p", "other:speed:=0.003"), "/path_follower", 0.004),
+        # Sections of others do not matter.
+        ([COMMON + OWN + "/lab1/camera: {ros__parameters: {exposure: 3}}\n"], LAB1, "/lab1/path_follower", 0.004),
     ],
 )
-def test_a_setup_applies_in_any_namespace_and_under_any_name(followed, arguments: tuple[str, ...], name: str):
-    assert followed([COMMON + OWN], arguments) == (name, 0.004, 0.006)
-    assert followed([COMMON, OWN], arguments) == (name, 0.004, 0.006)
-
-
-@pytest.mark.parametrize(
-    ("text", "speed"),
-    [
-        ("path_follower: {ros__parameters: {speed: 0.002}}", 0.002),
-        ("left_follower: {ros__parameters: {speed: 0.002}}", 0.002),
-        ("/**/left_follower: {ros__parameters: {speed: 0.002}}", 0.002),
-        (OWN + "/left_follower: {ros__parameters: {speed: 0.002}}", 0.002),
-        ("/left_follower: {ros__parameters: {speed: 0.002}}\n" + OWN, 0.004),
-        ("/right_follower: {ros__parameters: {speed: 0.001}}\n/**: {ros__parameters: {speed: 0.002}}", 0.002),
-    ],
-)
-def test_a_renamed_node_takes_the_section_of_its_kind_and_that_of_its_name(followed, text: str, speed: float):
-    assert followed([text], LEFT)[1] == speed
-
-
-@pytest.mark.parametrize(
-    ("texts", "arguments", "speed"),
-    [
-        # rcl merges all by key, and would take 0.004 in the first four.
-        ([COMMON + OWN], ("-p", "speed:=0.003"), 0.003),
-        ([COMMON + OWN, "/**: {ros__parameters: {speed: 0.003}}"], (), 0.003),
-        ([COMMON + OWN], (*LAB1, "-p", "path_follower:speed:=0.003"), 0.003),
-        ([COMMON + OWN], (*LAB1, *LEFT, "--param", "left_follower:speed:=0.003"), 0.003),
-        ([COMMON + OWN], ("-p", "other:speed:=0.003"), 0.004),
-        ([OWN, OWN.replace("0.004", "0.002")], (), 0.002),
-        ([OWN + OWN.replace("**", "*").replace("0.004", "0.002")], LAB1, 0.002),
-    ],
-)
-def test_what_comes_later_counts(followed, texts: list[str], arguments: tuple[str, ...], speed: float):
-    assert followed(texts, arguments)[1] == speed
+def test_what_files_and_command_line_give_a_node(
+    followed, texts: list[str], arguments: tuple[str, ...], name: str, speed: float
+):
+    assert followed(texts, arguments) == (name, speed, 0.006)
 
 
 @pytest.mark.parametrize(
     ("text", "arguments", "words"),
     [
-        ("path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got 'path_follower', expected one for /lab1/path_"),
-        ("coil_bridge: {ros__parameters: {rate: 50.0}}", (), "got 'coil_bridge', expected one for /path_follower: "),
+        (
+            "path_follower: {ros__parameters: {speed: 0.002}}",
+            LAB1,
+            "got '/path_follower', expected one for /lab1/path_",
+        ),
         ("/**/console: {ros__parameters: {rate: 50.0}}", LEFT, "or /left_follower or /**"),
         # The rest would be defaults, which is as bad as nothing that applies.
-        (COMMON + "path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, path_follower', expected one"),
         (COMMON + "/lab2/path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, /lab2/path_follower'"),
         ("", (), "parameter file: got None, expected sections by node"),
     ],
@@ -119,11 +97,6 @@ def test_a_file_of_which_nothing_applies_or_that_is_none_is_refused(
     assert str(caught.value).startswith(str(tmp_path / "0.yaml"))
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_sections_of_others_do_not_matter(followed):
-    text = "/lab1/camera: {ros__parameters: {exposure: 3}}\n/**/coil_bridge: {ros__parameters: {rate: 50.0}}\n"
-    assert followed([OWN + text], LAB1)[1] == 0.004
 
 
 def test_a_node_knows_the_settings_of_another_by_the_same_files(tmp_path: Path, domain: int):

@@ -1,4 +1,4 @@
-"""The thread model told of another thread, liquid or scene while it runs: by parameters and by topics."""
+"""The thread model told of another thread or liquid while it runs: by parameters and by a topic."""
 
 from __future__ import annotations
 
@@ -11,16 +11,9 @@ from magnetosuture_msgs.msg import ThreadMaterial
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from test.nodes import wire
-from test.thread.worlds import scene_with
-
-POST = Disc((-0.005, 0.003), 0.002)
-SQUARE = ((-0.012, 0.001), (-0.006, 0.001), (-0.006, 0.007), (-0.012, 0.007))
 
 
 class Bench:
@@ -30,7 +23,6 @@ class Bench:
         self.graph = graph
         self.node = graph.add(ThreadModelNode, initial_shape="straight", scene="dish_150mm")
         self.predicted, self.margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-        self.diagnostics = graph.listen(topics.DIAGNOSTICS)
         self.shown = 0
 
     def show(self, count: int) -> np.ndarray:
@@ -45,22 +37,12 @@ class Bench:
             assert self.margins[-1].scene_version == self.predicted[-1].scene_version
         return np.array([[vertex.x, vertex.y] for vertex in self.predicted[-1].positions])
 
-    def place(self, scene: Scene) -> None:
-        """Publish a scene, and wait until the node goes by it."""
-        self.graph.publish(topics.SCENE, wire.scene_message(self.graph.now(), scene))
-        self.graph.wait(lambda: self.node._session.scene_version == scene.version, "the scene")
-
     def set(self, **values: Any) -> str:
         """Set parameters together, as `ros2 param load` does; return why they were refused."""
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         name = "thread_model/set_parameters_atomically"
         result = self.graph.call(SetParametersAtomically, name, parameters=parameters).result
         return "" if result.successful else str(result.reason)
-
-    def said(self, words: str) -> bool:
-        """Return whether a refusal on /diagnostics has these words."""
-        values = [entry for message in list(self.diagnostics) for entry in message.status[0].values]
-        return any(words in entry.value for entry in values if entry.key == "last refusal")
 
 
 @pytest.fixture
@@ -79,18 +61,6 @@ def test_parameters_count_from_the_next_pose_on(bench: Bench):
     assert bench.node.get_parameter("viscosity").value == bench.node.settings.viscosity == 0.3
 
 
-def test_a_scene_counts_from_the_next_pose_on(bench: Bench):
-    bench.show(3)
-    bench.place(scene_with(POST, Polygon(SQUARE)))
-    bench.show(2)
-    assert {0, 1} <= set(bench.margins[-1].obstacle)
-    assert bench.set(viscosity=0.5) == ""
-    bench.place(scene_with())
-    bench.show(2)
-    names = bench.margins[-1].barrier_names
-    assert not any(names[row] == "obstacle" for row in bench.margins[-1].barrier)
-
-
 def test_a_material_comes_by_topic_and_is_parameters_then(graph, bench: Bench):
     bench.show(3)
     graph.publish(topics.MATERIAL, ThreadMaterial(viscosity=0.7, drag_anisotropy=0.6, rest_curvature=[20.0]))
@@ -101,7 +71,6 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph, bench: Bench):
     bench.show(3)
     assert bench.predicted[-1].material == "silk_6_0"
     assert bench.node.settings.rest_curvature == 20.0
-    assert not bench.said("thread_model.")
 
 
 REFUSED = (
@@ -121,14 +90,6 @@ def test_a_refused_parameter_leaves_all_as_it_was(bench: Bench):
         assert len(reason) < 700
         assert bench.node.settings is bench.node._session.settings is before
     bench.show(2)
-
-
-def test_a_refused_scene_is_reported_and_leaves_all_as_it_was(graph, bench: Bench):
-    bench.show(2)
-    graph.publish(topics.SCENE, wire.scene_message(graph.now(), scene_with(Disc((0.005, 0.005), 1e-4))))
-    graph.wait(lambda: bench.said("half of a segment"), "a refusal")
-    bench.show(2)
-    assert bench.margins[-1].scene_version == read_scene("dish_150mm").version
 
 
 def test_a_material_that_cannot_be_leaves_an_unconfigured_node_as_it_was(graph):
