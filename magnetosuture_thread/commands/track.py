@@ -24,20 +24,19 @@ from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.recorded import read_image
-from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
+from magnetosuture_thread.evaluation.metrics import SensorSilence
+from magnetosuture_thread.evaluation.recorded import read_image
+from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.geometry.thread_observation import ThreadPiece
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import read_regular
+from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
 from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
-from magnetosuture_thread.settings.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_region
 from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
 from magnetosuture_thread.vision.video import VIDEOS, Video
-from magnetosuture_thread.workers import Log
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
@@ -84,14 +83,15 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     Where no frame shows a needle the command fails.
     """
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
-    view: dict[str, Any] = {} if options.metres_per_pixel is None else {"metres_per_pixel": options.metres_per_pixel}
-    if options.centre is not None:
-        view["dish_centre_px"] = tuple(options.centre)
-    if options.region is not None:
-        view["region_px"] = tuple(options.region)
-    view |= {"rim": options.rim} if options.rim else {}
-    view |= {"max_needle_brightness": options.needle_brightness} if options.needle_brightness else {}
-    settings = replace(setup.vision, **view)
+    view = {
+        "metres_per_pixel": options.metres_per_pixel,
+        "dish_centre_px": tuple(options.centre or ()),
+        "region_px": tuple(options.region or ()),
+        "rim": options.rim,
+        "max_needle_brightness": options.needle_brightness,
+    }
+    chosen: dict[str, Any] = {name: value for name, value in view.items() if value}
+    settings = replace(setup.vision, **chosen)
     source = FrameSource(options, terminal.log)
     if source.is_sequence and source.names:
         how = f"read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
@@ -100,7 +100,7 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     if options.tip is not None:
         tracker.point_at_tip(np.array(options.tip))
     warm_up()
-    rows = []
+    rows: list[dict[str, Any]] = []
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
     files = numbered([Path(name).stem for name in source.names], "{}_{}")
     with (
@@ -110,16 +110,14 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
         for index, frame in enumerate(source):
             tracker.set_lens(frame.lens)
             began = time.thread_time()
-            seen = _look(tracker, frame, source.is_sequence)
-            unverified = {"unverified": source.unverified} if source.unverified else {}
-            rows.append(_row(frame, seen, time.thread_time() - began) | unverified)
+            track = _look(tracker, frame, source.is_sequence)
+            rows.append(_row(frame, track, time.thread_time() - began))
+            if source.unverified:
+                rows[-1]["unverified"] = source.unverified
             if writer is not None and frame.image is not None:
-                picture = frame.image
-                if frame.lens is not None and frame.lens.problem_with(picture.shape) is None:
-                    picture = frame.lens.undistorted(picture)
-                drawn = draw_overlay(picture, seen, settings.needle_length, frame.name)
-                if seen.view is not None:
-                    draw_dish(drawn, seen.view.centre_px, setup.scene.dish.radius / seen.view.metres_per_pixel)
+                drawn = draw_overlay(frame.undistorted(), track, settings.needle_length, frame.name)
+                if track.view is not None:
+                    draw_dish(drawn, track.view.centre_px, setup.scene.dish.radius / track.view.metres_per_pixel)
                 draw_region(drawn, settings.region_px)
                 writer.write(files[index] if files else f"frame_{index:06d}", drawn)
             advance((index + 1) / max(source.count, 1))
@@ -154,6 +152,16 @@ class FrameFile:
     stamp: float | None = None
     lens: Lens | None = None
 
+    @property
+    def lens_problem(self) -> InvalidInputError | None:
+        """Return why the lens is not that of the image; None if it is, or there is none."""
+        return None if self.lens is None or self.image is None else self.lens.problem_with(self.image.shape)
+
+    def undistorted(self) -> np.ndarray:
+        """Return the image, which must be there, without the lens's distortion where the lens can be used."""
+        assert self.image is not None
+        return self.image if self.lens is None or self.lens_problem else self.lens.undistorted(self.image)
+
 
 class FrameSource:
     """The frames at given paths: pictures in the order given, those of a folder by name, of a video or bag by time.
@@ -177,28 +185,28 @@ class FrameSource:
 
     def __init__(self, options: argparse.Namespace, log: Log) -> None:
         paths: list[Path] = options.frames
-        self._path = paths[0]
+        self._path, self._rate = paths[0], options.rate or 30.0
         self._lens = read_lens(options.camera_info) if options.camera_info is not None else None
         self._files: list[Path] = []
         self._recording: Recording | None = None
         self._video: Video | None = None
         self._lens_problems: Counter[str] = Counter()
         self.problems: Counter[str] = Counter()
-        self.count, self.unverified, self._rate = 0, "", options.rate or 30.0
+        self.count, self.unverified = 0, ""
         for path in paths:
-            inside = _files_at(path)
+            files = _files_at(path)
             is_video = path.suffix.lower() in VIDEOS and not path.is_dir()
-            is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside))
-            if not (is_bag or is_video):
-                self._files += inside
-                self.count = len(self._files)
-            elif len(paths) > 1:
+            is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *files))
+            if (is_bag or is_video) and len(paths) > 1:
                 raise BagError(path, f"is a {'bag' if is_bag else 'video'}; expected it alone, without other frames")
-            elif is_bag:
+            if is_bag:
                 self._open(Bag(path, remap=dict(options.remap)), log)
-            else:
+            elif is_video:
                 self._video = Video(path, options.rate)
                 self._rate, self.count = self._video.rate, self._video.count
+            else:
+                self._files += files
+                self.count = len(self._files)
         is_folder = len(paths) == 1 and len(self._files) > 1 and paths[0].is_dir() and _of_one_size(self._files)
         self.is_sequence = is_folder or not self._files
         if options.remap and self._recording is None:
@@ -206,8 +214,7 @@ class FrameSource:
         if options.rate is not None and not (is_folder or self._video):
             raise BagError(paths[0], "is no video and no folder of frames of one size, so --rate has no meaning for it")
         names = [file.name for file in self._files]
-        unique = len(set(names)) == len(names)
-        self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
+        self.names = numbered(names if len(set(names)) == len(names) else list(map(str, self._files)), "{} ({})")
 
     def _open(self, bag: Bag, log: Log) -> None:
         recording = self._recording = Recording(bag)
@@ -363,15 +370,14 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         duration: processor time that looking took, on one core, decoding not included; other work on the
             machine does not show in it [s].
     """
-    names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
-    pose: dict[str, Any] = dict.fromkeys(names)
-    if not track.reason:
-        thread, angle = track.centreline, math.atan2(track.heading[1], track.heading[0])
-        pose["tail_m"], pose["heading_rad"] = _numbers(track.tail), finite_or_none(angle)
-        pose["tip_m"], pose["curvature_per_m"] = _numbers(track.tip), finite_or_none(float(track.curvature))
-        pose["thread_m"] = thread.tolist() if np.isfinite(thread).all() else None
-        pose["pieces"] = [_piece(piece) for piece in track.observation.pieces]
-    length = track.needle_length
+    pose = {
+        "tail_m": _finite(track.tail),
+        "heading_rad": _finite(np.arctan2(track.heading[1], track.heading[0])),
+        "tip_m": _finite(track.tip),
+        "curvature_per_m": _finite(np.float64(track.curvature)),
+        "thread_m": _finite(track.centreline),
+        "pieces": [_piece(piece) for piece in track.observation.pieces],
+    }
     return {
         "file": frame.name,
         "status": track.state.value,
@@ -381,17 +387,18 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         "dish_centre_px": None if track.view is None else list(track.view.centre_px),
         "metres_per_pixel": None if track.view is None else track.view.metres_per_pixel,
         "scale_doubt": None if track.view is None else track.scale_error,
-        **pose,
-        "needle_length_m": None if length is None else finite_or_none(float(length)),
+        **(dict.fromkeys(pose) if track.reason else pose),
+        "needle_length_m": None if track.needle_length is None else _finite(np.float64(track.needle_length)),
         "complete": track.observation.complete,
-        "confidence": finite_or_none(float(track.confidence)),
+        "confidence": _finite(np.float64(track.confidence)),
         "time_s": duration,
         "stamp_s": frame.stamp,
     }
 
 
-def _numbers(values: np.ndarray) -> list[float] | None:
-    return [float(value) for value in values] if np.isfinite(values).all() else None
+def _finite(values: np.ndarray | np.float64) -> Any:
+    """Return a number, or an array as lists; None where any of it is not finite."""
+    return values.tolist() if np.isfinite(values).all() else None
 
 
 def _piece(piece: ThreadPiece) -> dict[str, Any]:
@@ -401,7 +408,7 @@ def _piece(piece: ThreadPiece) -> dict[str, Any]:
         "deviation_m": piece.deviation.tolist(),
         "first_end": piece.first_end.name.lower(),
         "last_end": piece.last_end.name.lower(),
-        "arc_length_m": [finite_or_none(float(value)) for value in piece.arc_length],
+        "arc_length_m": [_finite(np.float64(value)) for value in piece.arc_length],
         "direction_known": piece.direction_known,
         "confidence": piece.confidence,
     }
@@ -411,18 +418,19 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return a row for each of the first frames, as `_row` gives them."""
     began, lines = rows[0]["stamp_s"] if rows else None, []
     for row in rows[:20]:
-        cells = ["", "", "", ""]
-        if not row["reason"]:
-            length = np.linalg.norm(np.diff(np.reshape(row["thread_m"] or [], (-1, 2)), axis=0), axis=1).sum()
-            cells = [
+        name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
+        points = np.reshape(row["thread_m"] or [], (-1, 2))
+        lines.append(
+            (
+                name,
+                ": ".join(filter(None, (row["status"], row["reason"]))),
                 ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
                 "" if row["heading_rad"] is None else f"{math.degrees(row['heading_rad']):.1f}",
-                "" if row["thread_m"] is None else f"{1e3 * length:.1f}",
-                "" if row["confidence"] is None else f"{row['confidence']:.2f}",
-            ]
-        name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
-        status = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
-        lines.append((name, status, *cells, f"{row['time_s'] * 1e3:.1f}"))
+                "" if not len(points) else f"{1e3 * np.linalg.norm(np.diff(points, axis=0), axis=1).sum():.1f}",
+                "" if row["reason"] or row["confidence"] is None else f"{row['confidence']:.2f}",
+                f"{row['time_s'] * 1e3:.1f}",
+            )
+        )
     if len(rows) > 20:
         lines.append((f"and {len(rows) - 20} more", "", "", "", "", "", ""))
     caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.calibration.bags import calibrate_bags, thread_settings
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
-from magnetosuture_thread.commands.calibrate import calibrate_bags, material_named, thread_settings
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.rig.setups import read_setup
-from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 from test.bags.bags import copy_with_notes
 from test.calibration.runs import LENGTH, rig_run
 
@@ -125,7 +125,11 @@ def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
     [
         (["nowhere"], 1, "nowhere: does not exist"),
         (["one", "--parameters", "elastic_module"], 2, "did you mean elastic_modulus"),
-        (["one", "--material", "steel"], 2, "material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
+        (
+            ["one", "--material", "steel"],
+            2,
+            "material: got 'steel', expected one of polyamide_7_0, silk_6_0, or how",
+        ),
         (["one", "--against", "truth", "--remap", "/ground_truth/thread:=/elsewhere"], 1, "holds no ground truth"),
         (["one", "--source", "camera"], 1, "camera/image_raw"),
     ],
@@ -153,17 +157,9 @@ def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
         calibrate_bags([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", setup_name=own)
 
 
-def test_a_material_is_told_by_how_it_begins():
-    assert material_named("silk") == "silk_6_0"
-    assert material_named("polyamide_7_0") == "polyamide_7_0"
-    for text in ("", "steel"):
-        with pytest.raises(ConfigurationError, match="or how it begins"):
-            material_named(text)
-
-
 def test_another_material_comes_with_its_own_numbers():
     setup = read_setup("petri_35mm_polyamide")
     own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
-    assert thread_settings(own, "polyamide") == own.model
+    assert thread_settings(own, "polyamide") == thread_settings(own) == own.model
     silk = thread_settings(own, "silk", "paper")
     assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

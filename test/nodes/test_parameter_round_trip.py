@@ -12,7 +12,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
-from magnetosuture_thread.settings.resources import find_setup_file
+from magnetosuture_thread.settings.files import find_file
 
 READ_ONLY = "Trying to set a read-only parameter"  # parameters of rclpy
 
@@ -43,7 +43,7 @@ def dumped(graph: Any, client: AsyncParameterClient, name: str) -> dict[str, Any
 
 @pytest.mark.parametrize("kind", [CoilBridgeNode, ThreadModelNode], ids=lambda kind: kind.__name__)
 def test_parameters_that_are_dumped_are_loaded_again_and_started_with(graph, kind: Any, tmp_path: Path):
-    node = started(graph, kind, find_setup_file("hernia_ring"))
+    node = started(graph, kind, find_file("setup", "hernia_ring"))
     name, file = node.get_fully_qualified_name(), tmp_path / "dumped.yaml"
     client = AsyncParameterClient(graph.probe, name)
     graph.wait(client.services_are_ready, "the parameter services")
