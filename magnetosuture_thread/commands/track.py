@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -31,7 +31,7 @@ from magnetosuture_thread.geometry.thread_observation import ThreadPiece
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
-from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
+from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES, Channel
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_region
@@ -92,7 +92,7 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     }
     chosen: dict[str, Any] = {name: value for name, value in view.items() if value}
     settings = replace(setup.vision, **chosen)
-    source = FrameSource(options, terminal.log)
+    source = open_frames(options, terminal.log)
     if source.is_sequence and source.names:
         how = f"read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
         terminal.log(f"{options.frames[0]} is {how}")
@@ -107,7 +107,7 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
         terminal.progress("track") as advance,
         nullcontext() if options.overlay is None else OverlayWriter(options.overlay, source.rate()) as writer,
     ):
-        for index, frame in enumerate(source):
+        for index, frame in enumerate(source.frames):
             tracker.set_lens(frame.lens)
             began = time.thread_time()
             track = _look(tracker, frame, source.is_sequence)
@@ -138,8 +138,7 @@ class FrameFile:
     """One frame.
 
     Attributes:
-        name: the file's, with its folders where two have the same, numbered where a file is given twice; or topic or
-            video and stamp.
+        name: the file's, with its folders where two have the same; or topic or video and stamp.
         image: None if it is broken.
         problem: why it is; else empty.
         stamp: when it was taken [s], of a video or folder after its first frame; None where nothing tells.
@@ -163,85 +162,39 @@ class FrameFile:
         return self.image if self.lens is None or self.lens_problem else self.lens.undistorted(self.image)
 
 
+@dataclass
 class FrameSource:
-    """The frames at given paths: pictures in the order given, those of a folder by name, of a video or bag by time.
-
-    Args:
-        options: of `command.add_frames`.
-        log: called with a line for a person on what of a bag is damaged or not checked.
+    """The frames at some paths: pictures in their order, those of a folder by name, of a video or bag by time.
 
     Attributes:
-        count: number of frames.
-        names: of picture files; empty for a bag or video.
+        frames: to go through once.
+        count: number of frames, as far as it is known before.
+        rate: returns the frame rate [1/s].
         is_sequence: whether the frames follow one another in time: those of a bag, a video, or one folder of pictures
             of one size.
+        names: of picture files; empty for a bag or video.
         unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
-        problems: why frames that were gone through could not be taken, with their number.
-
-    Raises:
-        BagError: a path does not exist, a folder holds no pictures, or a bag or video cannot be used.
-        InvalidInputError: the lens cannot be used.
+        refused: why frames that were gone through could not be taken, with their number.
+        remarks: on the frames that were taken.
     """
 
-    def __init__(self, options: argparse.Namespace, log: Log) -> None:
-        paths: list[Path] = options.frames
-        self._path, self._rate = paths[0], options.rate or 30.0
-        self._lens = read_lens(options.camera_info) if options.camera_info is not None else None
-        self._files: list[Path] = []
-        self._recording: Recording | None = None
-        self._video: Video | None = None
-        self._lens_problems: Counter[str] = Counter()
-        self.problems: Counter[str] = Counter()
-        self.count, self.unverified = 0, ""
-        for path in paths:
-            files = _files_at(path)
-            is_video = path.suffix.lower() in VIDEOS and not path.is_dir()
-            is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *files))
-            if (is_bag or is_video) and len(paths) > 1:
-                raise BagError(path, f"is a {'bag' if is_bag else 'video'}; expected it alone, without other frames")
-            if is_bag:
-                self._open(Bag(path, remap=dict(options.remap)), log)
-            elif is_video:
-                self._video = Video(path, options.rate)
-                self._rate, self.count = self._video.rate, self._video.count
-            else:
-                self._files += files
-                self.count = len(self._files)
-        is_folder = len(paths) == 1 and len(self._files) > 1 and paths[0].is_dir() and _of_one_size(self._files)
-        self.is_sequence = is_folder or not self._files
-        if options.remap and self._recording is None:
-            raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
-        if options.rate is not None and not (is_folder or self._video):
-            raise BagError(paths[0], "is no video and no folder of frames of one size, so --rate has no meaning for it")
-        names = [file.name for file in self._files]
-        self.names = numbered(names if len(set(names)) == len(names) else list(map(str, self._files)), "{} ({})")
+    frames: Iterator[FrameFile] = field(default_factory=lambda: iter(()))
+    count: int = 0
+    rate: Callable[[], float] = lambda: 30.0
+    is_sequence: bool = True
+    names: Sequence[str] = ()
+    unverified: str = ""
+    refused: Counter[str] = field(default_factory=Counter)
+    remarks: set[str] = field(default_factory=set)
 
-    def _open(self, bag: Bag, log: Log) -> None:
-        recording = self._recording = Recording(bag)
-        self.unverified = bag.unverified
-        doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
-        for line in (str(bag.damage or ""), doubt, *recording.remarks):
-            if line:
-                log(f"{recording.path} {line}")
-        if recording.camera is None:
-            topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
-            problem = f"holds no camera frames; expected some on {topics}; its topics: {present}"
-            raise BagError(recording.path, problem)
-        if recording.rectified and self._lens is not None:
-            raise BagError(recording.path, f"has rectified frames on {recording.rectified}; omit --camera-info")
-        self.count = recording.counts[recording.camera.recorded]
+    def log_refused(self, log: Log) -> None:
+        """Log why frames could not be taken, once all have been gone through."""
+        for reason, count in self.refused.items():
+            log(f"{reason}: {pluralize(count, 'frame')} left out")
+        for remark in self.remarks:
+            log(remark)
 
-    def __iter__(self) -> Iterator[FrameFile]:
-        """Go through the frames."""
-        if self._recording is not None:
-            yield from self._recorded(self._recording)
-        if self._video is not None:
-            yield from self._filmed(self._video)
-        for index, (name, file) in enumerate(zip(self.names, self._files, strict=True)):
-            stamp = index / self._rate if self.is_sequence else None
-            yield self._frame(name, partial(_read_picture, file), stamp, self._lens)
-
-    def _frame(self, name: str, read: Callable[[], np.ndarray], stamp: float | None, lens: Lens | None) -> FrameFile:
+    def read(self, name: str, read: Callable[[], np.ndarray], stamp: float | None, lens: Lens | None) -> FrameFile:
         """Return a frame, or why it cannot be read."""
         try:
             return FrameFile(name, read(), "", stamp, lens)
@@ -249,51 +202,102 @@ class FrameSource:
             problem = f"cannot be read: {error.strerror}"
         except (BagError, InvalidInputError) as error:
             problem = str(error)
-        self.problems[problem] += 1
+        self.refused[problem] += 1
         return FrameFile(name, None, problem, stamp, lens)
 
-    def _filmed(self, video: Video) -> Iterator[FrameFile]:
-        found = 0
-        for stamp, image in video.frames():
-            found += 1
-            yield FrameFile(f"{self._path.name} {stamp:.6f}", image, "", stamp, self._lens)
-        if found < self.count:
-            self.problems[f"{self._path} is damaged"] += self.count - found
 
-    def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
-        lens: Lens | None = None
-        recording.refused.clear()  # counted by `rate` too
-        wanted = [channel for channel in (CAMERA_INFO, recording.camera) if channel is not None]
-        for record in recording.records([channel for channel in wanted if recording.counts.get(channel.recorded)]):
-            if record.topic == CAMERA_INFO.recorded:
-                try:
-                    lens = lens_of(record.decode())
-                except (BagError, InvalidInputError) as error:
-                    lens = None
-                    self._lens_problems[str(error)] += 1
-                continue
-            stamp = stamp_of(record) * 1e-9
-            name = f"{record.topic} {stamp:.6f}"
-            yield self._frame(name, partial(read_image, record), stamp, self._lens or lens)
+def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
+    """Open the frames that the options of `command.add_frames` name.
 
-    def log_refused(self, log: Log) -> None:
-        """Log why frames could not be taken, once all have been gone through."""
-        refused = self._recording.refused if self._recording is not None else Counter[str]()
-        for reason, count in (refused + self.problems).items():
-            log(f"{reason}: {pluralize(count, 'frame')} left out")
-        for problem in self._lens_problems:
-            log(f"{problem}: frames are taken as they are")
+    Args:
+        options: of the command.
+        log: called with a line for a person on what of a bag is damaged or not checked.
 
-    def rate(self) -> float:
-        """Return the frame rate; of a bag by the median interval of its first frames' stamps."""
-        if self._recording is None or self._recording.camera is None:
-            return self._rate
-        stamps = [stamp_of(record) for record in islice(self._recording.records([self._recording.camera]), 300)]
-        intervals = np.diff(stamps) * 1e-9
-        if not np.any(intervals > 0.0):
-            return 30.0
-        # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
-        return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
+    Raises:
+        BagError: a path does not exist, a folder holds no pictures, or a bag or video cannot be used.
+        InvalidInputError: the lens cannot be used.
+    """
+    lens = read_lens(options.camera_info) if options.camera_info is not None else None
+    paths: list[Path] = options.frames
+    path, files = paths[0], [file for path in paths for file in _files_at(path)]
+    is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (*paths, *files))
+    is_video = any(path.suffix.lower() in VIDEOS and not path.is_dir() for path in paths)
+    is_folder = not is_bag and len(paths) == 1 and len(files) > 1 and _of_one_size(files)
+    if (is_bag or is_video) and len(paths) > 1:
+        raise BagError(path, f"is beside a {'bag' if is_bag else 'video'}; expected that alone, without other frames")
+    if options.remap and not is_bag:
+        raise BagError(path, "is no bag, so there is no topic in it to remap")
+    if options.rate is not None and not (is_folder or is_video):
+        raise BagError(path, "is no video and no folder of frames of one size, so --rate has no meaning for it")
+    source = FrameSource(is_sequence=is_bag or is_video or is_folder)
+    if is_bag:
+        recording, camera = _open_recording(Bag(path, remap=dict(options.remap)), log)
+        if recording.rectified and lens is not None:
+            raise BagError(path, f"has rectified frames on {recording.rectified}; omit --camera-info")
+        source.count, source.unverified = recording.counts[camera.recorded], recording.unverified
+        source.rate = partial(_median_rate, recording, camera)
+        source.frames = _recorded(source, recording, camera, lens)
+    elif is_video:
+        video = Video(path, options.rate)
+        source.count, source.rate = video.count, lambda: video.rate
+        source.frames = _filmed(source, path, video, lens)
+    else:
+        rate, names = options.rate or 30.0, [file.name for file in files]
+        source.count, source.rate = len(files), lambda: rate
+        source.names = names if len(set(names)) == len(names) else list(map(str, files))
+        source.frames = (
+            source.read(name, partial(_read_picture, file), index / rate if is_folder else None, lens)
+            for index, (name, file) in enumerate(zip(source.names, files, strict=True))
+        )
+    return source
+
+
+def _open_recording(bag: Bag, log: Log) -> tuple[Recording, Channel]:
+    """Return a bag with its camera, and log what is unusual about it."""
+    recording = Recording(bag)
+    doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
+    for line in (str(bag.damage or ""), doubt, *recording.remarks):
+        if line:
+            log(f"{recording.path} {line}")
+    if recording.camera is None:
+        topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+        raise BagError(bag.path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
+    return recording, recording.camera
+
+
+def _filmed(source: FrameSource, path: Path, video: Video, lens: Lens | None) -> Iterator[FrameFile]:
+    count = 0
+    for stamp, image in video.frames():
+        count += 1
+        yield FrameFile(f"{path.name} {stamp:.6f}", image, "", stamp, lens)
+    if count < source.count:
+        source.refused[f"{path} is damaged"] += source.count - count
+
+
+def _recorded(source: FrameSource, recording: Recording, camera: Channel, override: Lens | None) -> Iterator[FrameFile]:
+    lens: Lens | None = None
+    channels = [channel for channel in (CAMERA_INFO, camera) if recording.counts.get(channel.recorded)]
+    recording.refused.clear()  # counted by the rate too
+    for record in recording.records(channels):
+        if record.topic == CAMERA_INFO.recorded:
+            try:
+                lens = lens_of(record.decode())
+            except (BagError, InvalidInputError) as error:
+                lens = None
+                source.remarks.add(f"{error}: frames are taken as they are")
+            continue
+        stamp = stamp_of(record) * 1e-9
+        yield source.read(f"{record.topic} {stamp:.6f}", partial(read_image, record), stamp, override or lens)
+    source.refused.update(recording.refused)
+
+
+def _median_rate(recording: Recording, camera: Channel) -> float:
+    """Return the frame rate by the median interval of a bag's first frames' stamps [1/s]."""
+    intervals = 1e-9 * np.diff([stamp_of(record) for record in islice(recording.records([camera]), 300)])
+    if not np.any(intervals > 0.0):
+        return 30.0
+    # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
+    return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -370,14 +374,12 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         duration: processor time that looking took, on one core, decoding not included; other work on the
             machine does not show in it [s].
     """
-    pose = {
-        "tail_m": _finite(track.tail),
-        "heading_rad": _finite(np.arctan2(track.heading[1], track.heading[0])),
-        "tip_m": _finite(track.tip),
-        "curvature_per_m": _finite(np.float64(track.curvature)),
-        "thread_m": _finite(track.centreline),
-        "pieces": [_piece(piece) for piece in track.observation.pieces],
-    }
+    names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
+    pose: dict[str, Any] = dict.fromkeys(names)
+    if not track.reason:
+        angle, pieces = np.arctan2(track.heading[1], track.heading[0]), map(_piece, track.observation.pieces)
+        values = (track.tail, angle, track.tip, np.float64(track.curvature), track.centreline)
+        pose = dict(zip(names, (*map(_finite, values), list(pieces)), strict=True))
     return {
         "file": frame.name,
         "status": track.state.value,
@@ -387,7 +389,7 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         "dish_centre_px": None if track.view is None else list(track.view.centre_px),
         "metres_per_pixel": None if track.view is None else track.view.metres_per_pixel,
         "scale_doubt": None if track.view is None else track.scale_error,
-        **(dict.fromkeys(pose) if track.reason else pose),
+        **pose,
         "needle_length_m": None if track.needle_length is None else _finite(np.float64(track.needle_length)),
         "complete": track.observation.complete,
         "confidence": _finite(np.float64(track.confidence)),

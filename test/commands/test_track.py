@@ -172,40 +172,26 @@ def test_a_video_is_followed_over_time_and_one_that_is_cut_off_is_reported(
 
 def test_a_picture_of_12_megapixels_is_measured_in_its_own_pixels(tmp_path: Path):
     large = cv2.resize(cv2.imread(str(SAMPLES / "frame_00.png")), (4000, 3000), interpolation=cv2.INTER_CUBIC)
-    picture, file, overlay = tmp_path / "large.jpg", tmp_path / "seen.json", tmp_path / "drawn"
+    picture, file, scale = tmp_path / "large.jpg", tmp_path / "seen.json", 4000 / 640
     cv2.imwrite(str(picture), large)
-    scale = 4000 / 640
     centre = [str((value + 0.5) * scale - 0.5) for value in (322, 238)]
-    given = ["--metres-per-pixel", str(8e-5 / scale), "--centre", *centre, "--overlay", str(overlay)]
+    given = ["--metres-per-pixel", str(8e-5 / scale), "--centre", *centre]
     assert cli.main(["track", str(picture), "--json", str(file), *given]) == 0
     truth = json.loads((SAMPLES / "truth.json").read_text())["frames"][0]
     np.testing.assert_allclose(json.loads(file.read_text())[0]["tail_m"], np.array(truth["tail_mm"]) * 1e-3, atol=5e-5)
-    drawn = cv2.imread(str(overlay / "large.png"))
-    assert drawn is not None
-    assert drawn.shape == (3000, 4000, 3)
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["track"],
-        ["calibrate-camera", "--dish-diameter", "0.035", "--output"],
-        ["evaluate", "--output"],
-        ["replay", "--offline", "--output"],
-    ],
-    ids=" ".join,
-)
-def test_every_command_names_an_encoding_that_it_cannot_read(
-    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", [["track"], ["calibrate-camera", "--dish-diameter", "0.035", "--output", "out"]])
+def test_an_encoding_that_cannot_be_read_is_named(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
+    monkeypatch.chdir(tmp_path)
     with BagWriter(tmp_path / "bag") as writer:
         writer.add_topic("/camera/image_raw", "sensor_msgs/msg/Image")
-        for index in range(12):
-            data = {"encoding": "32FC1", "data": np.zeros(48, np.uint8)}
-            message = make("sensor_msgs/msg/Image", stamped(1 + index, "camera"), 3, 4, step=16, **data)
-            writer.write_message("/camera/image_raw", (1 + index) * 10**9, message)
-    output = [str(tmp_path / "out")] if command[-1] == "--output" else []
-    assert cli.main([command[0], str(tmp_path / "bag"), *command[1:], *output]) == 1
+        data = {"encoding": "32FC1", "data": np.zeros(48, np.uint8)}
+        message = make("sensor_msgs/msg/Image", stamped(1, "camera"), 3, 4, step=16, **data)
+        writer.write_message("/camera/image_raw", 10**9, message)
+    assert cli.main([command[0], "bag", *command[1:]]) == 1
     captured = capsys.readouterr()
     assert "'32FC1'" in captured.out + captured.err
 
@@ -221,10 +207,10 @@ def test_paths_without_frames_are_refused_in_one_line(tmp_path: Path, capsys: py
         assert words in error_of(capsys)
 
 
-def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_calibration_is_written_as_parameters(tmp_path: Path):
     file = tmp_path / "camera.yaml"
     assert cli.main(["calibrate-camera", str(SAMPLES), "--dish-diameter", "0.035", "--output", str(file)]) == 0
-    assert "5 frames" in capsys.readouterr().out
+    assert yaml.safe_load(file.read_text())["/**/vision_tracker"]["ros__parameters"]["metres_per_pixel"] > 0.0
     given = ["--setup", str(file), "--scene", "dish_35mm", "--json", str(tmp_path / "seen.json")]
     assert cli.main(["track", *map(str, SAMPLES.glob("*.png")), *given]) == 0
     assert {row["status"] for row in json.loads((tmp_path / "seen.json").read_text())} == {"tracked"}
@@ -245,10 +231,7 @@ def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
     given = ["--dish-diameter", "0.035", "--output", str(output)]
     for options, error in ((["--camera-info", str(lens)], 3e-3), ([], 0.1)):
         assert cli.main(["calibrate-camera", str(frame), *given, *options]) == 0
-        (section,) = (
-            found for found in yaml.safe_load(output.read_text()).values() if "metres_per_pixel" in str(found)
-        )
-        scale = section["ros__parameters"]["metres_per_pixel"]
+        scale = yaml.safe_load(output.read_text())["/**/vision_tracker"]["ros__parameters"]["metres_per_pixel"]
         assert scale == pytest.approx(case.view.metres_per_pixel, rel=error)
     assert scale != pytest.approx(case.view.metres_per_pixel, rel=6e-3)
     lens.write_text(yaml.safe_dump(info | {"image_width": 1280}))
