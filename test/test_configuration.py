@@ -195,7 +195,7 @@ def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
     [
         ("[" * 20_000, "lists and mappings 21 deep in line 1"),
         ("a: &a [1, 2]\nb: *a\n", "an anchor or alias"),
-        ("# " + "x" * 1_000_000, "a larger file"),
+        ("# " + "x" * 4_000_000, "a larger file"),
     ],
 )
 def test_a_setup_past_its_budget_is_refused(tmp_path: Path, text: str, words: str):

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from magnetosuture_thread.calibration.parameters import choose_parameters
 from magnetosuture_thread.calibration.recorded_run import BestSettings, RecordedRun, read_run, replay_pool
@@ -28,11 +28,16 @@ if TYPE_CHECKING:
 READING = 0.15  # share of the time for reading the bags, and tracking their frames
 
 
+class FitSelection(BagSelection, total=False):
+    """What of the bags is read, and `picture`: of the fit and its residuals (.png); beside the output if None."""
+
+    picture: Path | None
+
+
 def calibrate_bags(
     bags: Sequence[Path],
     output: Path,
     *,
-    picture: Path | None = None,
     material: str = "",
     formulation: str = "",
     against: str = "seen",
@@ -41,7 +46,7 @@ def calibrate_bags(
     scheduler: str = "",
     log: Log = lambda line: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[FitSelection],
 ) -> CalibrationResult:
     """Fit a thread's parameters to bags, and write them as a file that `thread_model` loads, with a picture beside it.
 
@@ -51,7 +56,6 @@ def calibrate_bags(
     Args:
         bags: recorded runs of one thread.
         output: the YAML file to write.
-        picture: of the fit and its residuals (.png); beside the output if None.
         material: a name of `MATERIALS`, or the beginning of one; the setup's if empty.
         formulation: rod or paper; the setup's if empty.
         against: what predictions are compared with, `seen` (measured) or `truth`.
@@ -60,7 +64,7 @@ def calibrate_bags(
         scheduler: address of a Dask scheduler, whose workers replay the bags in place of those.
         log: called with a line for a person at the end of each stage.
         progress: called with the share done, 0 to 1.
-        selection: what of the bags is read.
+        selection: what of the bags is read, and `picture`.
 
     Raises:
         BagError: a bag cannot be used, or a file cannot be written.
@@ -69,13 +73,15 @@ def calibrate_bags(
     """
     from magnetosuture_thread.calibration.plot import draw_calibration  # late, as it imports matplotlib
 
+    picture = selection.pop("picture", None) or output.with_suffix(".png")
+
     def advance(index: int, share: float) -> None:
         progress(READING * (index + share) / len(bags))
 
     runs: list[RecordedRun] = []
     first: dict[str, tuple[Any, str]] = {}  # what all bags must have in common, and its words
     for index, path in enumerate(bags):
-        with open_bag(path, log, **selection) as bag:
+        with open_bag(path, log, **cast(BagSelection, selection)) as bag:
             settings = thread_settings(bag.setup, material, formulation)
             choose_parameters(settings.formulation, parameters)  # refuses wrong names before the bag is read
             thread = _recorded_setup(bag).model
@@ -109,7 +115,7 @@ def calibrate_bags(
         result, fits = unfinished_result(runs, settings, best)
     with whole_file(output) as partial_file:
         partial_file.write_text(to_yaml(result), encoding="utf-8")
-    with whole_file(picture or output.with_suffix(".png")) as partial_file:
+    with whole_file(picture) as partial_file:
         draw_calibration(partial_file, result, fits)
     return result
 

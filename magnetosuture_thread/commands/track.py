@@ -421,18 +421,14 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     began, lines = rows[0]["stamp_s"] if rows else None, []
     for row in rows[:20]:
         name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
-        points = np.reshape(row["thread_m"] or [], (-1, 2))
-        lines.append(
-            (
-                name,
-                ": ".join(filter(None, (row["status"], row["reason"]))),
-                ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
-                "" if row["heading_rad"] is None else f"{math.degrees(row['heading_rad']):.1f}",
-                "" if not len(points) else f"{1e3 * np.linalg.norm(np.diff(points, axis=0), axis=1).sum():.1f}",
-                "" if row["reason"] or row["confidence"] is None else f"{row['confidence']:.2f}",
-                f"{row['time_s'] * 1e3:.1f}",
-            )
-        )
+        cells = [""] * 4
+        if row["tail_m"] and row["heading_rad"] is not None:
+            steps = np.diff(np.reshape(row["thread_m"] or [], (-1, 2)), axis=0)
+            x, y, heading = 1e3 * row["tail_m"][0], 1e3 * row["tail_m"][1], math.degrees(row["heading_rad"])
+            length = f"{1e3 * np.hypot(*steps.T).sum():.1f}" if len(steps) else ""
+            cells = [f"{x:.2f}, {y:.2f}", f"{heading:.1f}", length, f"{row['confidence']:.2f}"]
+        status = ": ".join(filter(None, (row["status"], row["reason"])))
+        lines.append((name, status, *cells, f"{1e3 * row['time_s']:.1f}"))
     if len(rows) > 20:
         lines.append((f"and {len(rows) - 20} more", "", "", "", "", "", ""))
     caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
