@@ -134,15 +134,13 @@ class TaskRunner:
                 future.cancel()
 
     def _submit(self, task: Any) -> Future[Any]:
-        if self._scheduler and self._executor is not None:
-            return self._executor.submit(_run_task, *self._shared, task)
         with _environment_of_workers():
             try:
                 self._executor = self._executor or self._start_processes()
                 return self._executor.submit(_run_task, *self._shared, task)
             except BrokenExecutor:  # by the last task of a worker that died
-                self._executor = self._start_processes()
-                return self._executor.submit(_run_task, *self._shared, task)
+                self._executor = None
+                return self._submit(task)
 
     def _result_of(self, future: Future[Any], log: Log) -> Any:
         try:
@@ -190,13 +188,14 @@ class TaskRunner:
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
     """Block `STOPS` and set `ONE_THREAD`; a process keeps both as they are when it starts."""
-    before = dict(os.environ)
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:
-        os.environ.clear()
+        for name in ONE_THREAD:
+            del os.environ[name]
         os.environ.update(before)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
