@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from magnetosuture_thread.calibration.bags import calibrate_bags
     from magnetosuture_thread.coils.filter import FilteredCommand, NeedleSafetyFilter
-    from magnetosuture_thread.commands.calibrate import calibrate_bags
     from magnetosuture_thread.commands.replay import replay_offline
     from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
@@ -36,7 +36,7 @@ _HOME = {
     "settings.errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
-    "commands.calibrate": ("calibrate_bags",),
+    "calibration.bags": ("calibrate_bags",),
     "commands.replay": ("replay_offline",),
     "estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "thread.margins": ("BarrierMargins", "Margins"),

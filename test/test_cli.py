@@ -26,9 +26,6 @@ def test_help_names_every_command_and_the_exit_codes():
     assert shown.returncode == 0
     for words in (*COMMANDS, "no medical device", "0 done, 1 the job failed, 2 wrong use"):
         assert words in shown.stdout
-
-
-def test_every_command_has_its_summary_and_a_file():
     subparsers = next(action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
     for name, summary in COMMANDS.items():
         first_line = (subparsers.choices[name].description or "").partition("\n")[0]

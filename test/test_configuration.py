@@ -9,7 +9,7 @@ from typing import ClassVar
 import pytest
 
 from magnetosuture_thread.settings import shared_parameters as shared
-from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity
+from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity, read_yaml
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.parameter_files import key_matches, load_setup
 
@@ -169,3 +169,17 @@ def test_sections_are_for_whom_ros_has_them(tmp_path: Path, text: str, kettle: f
 )
 def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
     assert key_matches(key, node) == is_for
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 20_000, "lists and mappings 21 deep in line 1"),
+        ("a: &a [1, 2]\nb: *a\n", "an anchor or alias"),
+        ("# " + "x" * 4_000_000, "a larger file"),
+    ],
+)
+def test_a_setup_past_its_budget_is_refused(tmp_path: Path, text: str, words: str):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ConfigurationError, match=words):
+        read_yaml(tmp_path / "a.yaml", "setup file")

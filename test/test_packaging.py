@@ -17,7 +17,7 @@ from catkin_pkg.packages import find_packages
 
 import magnetosuture_thread
 from magnetosuture_thread.settings.errors import missing_module
-from magnetosuture_thread.settings.resources import share_directory
+from magnetosuture_thread.settings.files import share_directory
 from test.test_imports import MODULES, imported
 
 ROOT = Path(__file__).parent.parent

@@ -12,7 +12,7 @@ from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.resources import find_setup_file, share_directory
+from magnetosuture_thread.settings.files import find_file, share_directory
 from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 
 SHIPPED = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
@@ -108,6 +108,6 @@ def test_what_nodes_share_is_written_once(tmp_path: Path):
 
 def test_an_unknown_setup_is_refused_with_the_known_ones():
     with pytest.raises(ConfigurationError, match="petri_150mm_silk"):
-        find_setup_file("petri_36mm")
+        find_file("setup", "petri_36mm")
     with pytest.raises(ConfigurationError, match=r"nowhere\.yaml"):
-        find_setup_file("nowhere.yaml")
+        find_file("setup", "nowhere.yaml")

@@ -36,6 +36,14 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
+from magnetosuture_thread.bags.budgets import (
+    LONE_RECORD,
+    MAX_BLOCK_BYTES,
+    MAX_BLOCK_RECORDS,
+    MAX_RECORD_BYTES,
+    UnpackBudget,
+    open_ranges,
+)
 from magnetosuture_thread.bags.storage import (
     NOTES,
     Connection,
@@ -48,15 +56,7 @@ from magnetosuture_thread.bags.storage import (
     verified_notes,
 )
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, open_ranges, substitute_problem
-from magnetosuture_thread.settings.untrusted import (
-    LONE_RECORD,
-    MAX_BLOCK_BYTES,
-    MAX_BLOCK_RECORDS,
-    MAX_RECORD_BYTES,
-    BudgetError,
-    UnpackBudget,
-)
+from magnetosuture_thread.settings.files import HEAD_BYTES, BudgetError, is_url, substitute_problem
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content

@@ -16,17 +16,10 @@ from rosbags.typesys.msg import MSGParser
 from rosbags.typesys.peg import Failure, Parser
 from rosbags.typesys.store import Typestore
 
+from magnetosuture_thread.bags.budgets import MAX_DECODED, MAX_DEFINITION_CHARS, MAX_ELEMENTS, MAX_NESTING, ParserBudget
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.resources import share_directory
-from magnetosuture_thread.settings.untrusted import (
-    MAX_DECODED,
-    MAX_DEFINITION_CHARS,
-    MAX_ELEMENTS,
-    MAX_NESTING,
-    BudgetError,
-    ParserBudget,
-)
+from magnetosuture_thread.settings.files import BudgetError, share_directory
 
 Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 

@@ -17,6 +17,7 @@ from urllib.parse import quote
 import zstandard
 
 from magnetosuture_thread.bags import absolute_topic
+from magnetosuture_thread.bags.budgets import MAX_BLOCK_BYTES, UnpackBudget
 from magnetosuture_thread.bags.mcap import McapFile
 from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
 from magnetosuture_thread.bags.storage import (
@@ -36,7 +37,6 @@ from magnetosuture_thread.bags.storage import (
 )
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
-from magnetosuture_thread.settings.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 _SQLITE_ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a name
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget

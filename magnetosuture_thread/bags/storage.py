@@ -17,9 +17,8 @@ import yaml
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import read_regular
+from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, BudgetError, check_yaml, read_regular
 from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
-from magnetosuture_thread.settings.untrusted import MAX_METADATA_BYTES, MAX_TEXT_BYTES, BudgetError, check_yaml
 
 CDR = "cdr"  # how ROS 2 writes messages
 METADATA_FILE = "metadata.yaml"
@@ -265,7 +264,7 @@ def _by_number(path: Path) -> tuple[str, int, str]:
 def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
     """Return names of files, notes and custom data of a bag's metadata.yaml; and in a line why it is not used."""
     try:
-        text = read_regular(folder / METADATA_FILE, MAX_METADATA_BYTES).decode("utf-8")
+        text = read_regular(folder / METADATA_FILE, MAX_TEXT_BYTES).decode("utf-8")
         check_yaml(text, max_aliases=MAX_ALIASES)
         information = yaml.load(text, yaml.CSafeLoader)["rosbag2_bagfile_information"]
         names = list(dict.fromkeys(Path(name).name for name in information["relative_file_paths"]))

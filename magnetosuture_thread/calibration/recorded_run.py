@@ -17,11 +17,11 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import InitialObservation, ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, node_errors, target_points
+from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.errors import BagError, GraphError, InvalidInputError
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
 SETTLING = 1.0  # s after the start that are not compared: the noise of the first centreline straightens out in it
 MAX_FRAMES = 600  # compared, evenly over the run; every pose is replayed
@@ -240,7 +240,7 @@ def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> P
 
 @contextmanager
 def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") -> Iterator[RunTasks]:
-    """Give a function that runs tasks, here or in processes of their own; see `make_runner`.
+    """Give a function that runs tasks, here or in processes of their own; see `TaskRunner`.
 
     Args:
         runs: that tasks name by their index.
@@ -250,7 +250,7 @@ def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") 
     Raises:
         GraphError: a process died.
     """
-    with make_runner(partial(_run_task, tuple(runs)), workers, scheduler) as runner:
+    with TaskRunner(partial(_run_task, tuple(runs)), workers, scheduler) as runner:
 
         def run(tasks: Sequence[Task]) -> list[Points]:
             results: dict[int, Any] = dict(runner.run(tasks))

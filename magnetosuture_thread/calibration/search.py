@@ -43,10 +43,10 @@ from magnetosuture_thread.calibration.result import (
 )
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import ThreadSession
+from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import Attachment
-from magnetosuture_thread.workers import Log, Progress
 
 Array = NDArray[np.float64]
 

@@ -26,8 +26,7 @@ from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionDist
 from magnetosuture_thread.coils.needle_motion import STUCK
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.texts import shortened
+from magnetosuture_thread.settings.errors import InvalidInputError, shortened
 
 Vector = NDArray[np.float64]
 

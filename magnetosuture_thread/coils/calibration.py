@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.field import CoilProperties, loop_fields
 from magnetosuture_thread.settings.configuration import from_mapping, read_yaml, to_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.untrusted import MAX_TABLE_BYTES
+from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
 
 MODEL = "loops"  # of the field of a coil
 MIN_COILS = 3  # needed to pull in every direction
@@ -147,7 +146,7 @@ def read_measurements(path: Path) -> ProbeMeasurements:
         InvalidInputError: the file is unreadable, or a line is invalid; with its number.
     """
     try:
-        lines = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig").splitlines()
+        lines = read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise InvalidInputError(str(path), reason, "a readable CSV file") from None

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
-from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.texts import shortened
+from magnetosuture_thread.settings.errors import InvalidInputError, shortened
 
 Vector = NDArray[np.float64]
 

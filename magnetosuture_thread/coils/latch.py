@@ -8,8 +8,7 @@ from enum import Enum
 from pathlib import Path
 
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.outputs import output_problem
+from magnetosuture_thread.settings.files import output_problem, read_regular
 
 
 class ArmingState(Enum):

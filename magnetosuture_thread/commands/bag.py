@@ -14,8 +14,8 @@ from magnetosuture_thread.bags.check import inspect_bag, write_repaired_bag
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import pluralize, silence_text
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.settings.texts import one_line
+from magnetosuture_thread.settings.errors import one_line
+from magnetosuture_thread.settings.files import whole_folder
 
 DESCRIPTION = """\
 Check a recorded bag, or repair it.

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_file
-from magnetosuture_thread.commands.track import FrameSource
-from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.texts import one_line
+from magnetosuture_thread.commands.track import open_frames
+from magnetosuture_thread.settings.errors import BagError, one_line
+from magnetosuture_thread.settings.files import whole_file
 from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
@@ -47,25 +46,25 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     by_markers = options.markers is not None
     if by_markers and (options.region or options.rim):
         raise BagError(options.frames[0], "is calibrated by --markers, so --region and --rim have no meaning for it")
-    source = FrameSource(options, terminal.log)
+    source = open_frames(options, terminal.log)
     every = max(1, -(-source.count // 50))  # evenly over a long bag or video
     images: list[np.ndarray] = []
     unused = ""
-    for index, frame in enumerate(source):
+    for index, frame in enumerate(source.frames):
         if index % every or frame.image is None:
             continue
-        problem = frame.lens.problem_with(frame.image.shape) if frame.lens is not None else None
-        if problem is not None and options.camera_info is not None:
-            raise problem
-        unused = f"{problem}; it is not used" if problem is not None else unused
+        if (problem := frame.lens_problem) is not None:
+            if options.camera_info is not None:
+                raise problem
+            unused = f"{problem}; it is not used"
         if len(images) == 50:  # of a video that does not say how many it has
             break
-        images.append(np.asarray(frame.image if frame.lens is None or problem else frame.lens.undistorted(frame.image)))
+        images.append(frame.undistorted())
     source.log_refused(terminal.log)
     if unused:
         terminal.log(unused)
     if not images:
-        why = "; ".join(problem for problem, _ in source.problems.most_common(3))
+        why = "; ".join(problem for problem, _ in source.refused.most_common(3))
         raise BagError(options.frames[0], f"holds no frame that can be read: {why}")
     if by_markers:
         found = calibrate_by_markers(images, options.dish_diameter, *options.markers)

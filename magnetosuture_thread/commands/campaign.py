@@ -21,16 +21,16 @@ import numpy as np
 from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.page import page_style, read_source, read_template
+from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
+from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.rig import campaign as run
 from magnetosuture_thread.rig.closed_loop import RunBag
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
+from magnetosuture_thread.settings.files import whole_folder
 
 REASONS = {
     "min_needle_clearance_m": "the needle came too close to wall or shape",
@@ -81,7 +81,7 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
     with (
         terminal.progress("campaign") as advance,
         whole_folder(options.output) as folder,
-        make_runner(work, options.workers, options.scheduler) as runner,
+        TaskRunner(work, options.workers, options.scheduler) as runner,
     ):
         tasks = [(seed, folder / result.bags[seed] if seed in bags else None) for seed in seeds]
         found: dict[int, run.RunResult] = {}

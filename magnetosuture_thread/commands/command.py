@@ -14,16 +14,15 @@ from typing import Any, TypeAlias
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags import parse_remap
-from magnetosuture_thread.settings.files import parse_location
-from magnetosuture_thread.settings.outputs import input_problem, output_problem
-from magnetosuture_thread.settings.texts import printable
+from magnetosuture_thread.settings.errors import printable
+from magnetosuture_thread.settings.files import input_problem, output_problem, parse_location, whole_file
 
 DONE, FAILED, WRONG_USE = 0, 1, 2
 STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks
@@ -191,7 +190,7 @@ def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def bag_selection(options: argparse.Namespace) -> dict[str, Any]:
-    """Return how a bag is read: see `commands.recorded.BagSelection`."""
+    """Return how a bag is read: see `evaluation.recorded.BagSelection`."""
     chosen = given(options, *(name for name in ("source", "start", "duration", "frame") if hasattr(options, name)))
     return {"setup_name": options.setup, "remap": dict(options.remap), **chosen}
 
@@ -247,8 +246,7 @@ def make_log(console: Console) -> Callable[[str], None]:
 @contextmanager
 def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(console=console, transient=True) as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 
@@ -293,7 +291,5 @@ def make_table(
 def write_json(path: Path | None, figures: Any) -> None:
     """Write figures to the file given by --json, if any."""
     if path:
-        from magnetosuture_thread.commands.output import whole_file  # late, as --help needs no bags
-
         with whole_file(path) as partial:
             partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

@@ -22,29 +22,27 @@ from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.bags.storage import METADATA_FILE, find_bag_files
-from magnetosuture_thread.commands import command, recorded
-from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.replay import find_photos
 from magnetosuture_thread.commands.track import numbered
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import WAITING
-from magnetosuture_thread.evaluation import reference, tables
+from magnetosuture_thread.evaluation import recorded, reference, tables
 from magnetosuture_thread.evaluation.figures import STAGES, BagDetails, Figures, LiveFigures
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.page import write_page
 from magnetosuture_thread.evaluation.plots import draw_case, draw_worst_frame
 from magnetosuture_thread.evaluation.tables import Row
+from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields
-from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import is_url
+from magnetosuture_thread.settings.errors import BagError, one_line
+from magnetosuture_thread.settings.files import is_url, whole_folder
 from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
-from magnetosuture_thread.settings.texts import one_line
-from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -163,7 +161,7 @@ def evaluate_bags(
     names = numbered([name_of(bag) for bag in bags], "{}-{}")
     tasks = [EvaluationTask(bag, name, against, formulation, selection) for bag, name in zip(bags, names, strict=True)]
     rows: dict[int, Row] = {}
-    with whole_folder(output) as folder, make_runner(evaluate_one, workers, scheduler) as runner:
+    with whole_folder(output) as folder, TaskRunner(evaluate_one, workers, scheduler) as runner:
         for index, result in runner.run(tasks, log, progress):
             task = tasks[index]
             row, page = (_failed(task, str(result)), "") if isinstance(result, WorkerDiedError) else result

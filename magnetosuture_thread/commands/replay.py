@@ -16,16 +16,17 @@ from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands import command, recorded
-from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.estimator.thread_session import WAITING
+from magnetosuture_thread.evaluation import recorded
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, compare_errors, finite_or_none
 from magnetosuture_thread.evaluation.tables import summary_table
+from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.vision.tracker import FrameMeasurement, VisionTracker
-from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -35,16 +35,16 @@ from magnetosuture_thread import (
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import seconds
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.evaluation.plots import FAINT, INK, KIND_COLOURS, draw_empty_dish, shape_patch, tidy
+from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.interface import OPERATOR_COMMAND
 from magnetosuture_thread.thread.margins import FrictionState, friction_colour
-from magnetosuture_thread.workers import Log, Progress
 
 RATE = 33.0  # Hz, of the paper's simulation
 COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge

@@ -15,18 +15,18 @@ from rich.table import Table
 from magnetosuture_thread import Scene
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import stamp_of
-from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.simulate import measure_loop, simulate
 from magnetosuture_thread.evaluation.figures import AGAINST
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import LoopSummary
 from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, look_at, tidy
+from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.interface import COMPRESSED_IMAGE
 from magnetosuture_thread.vision.images import decode_image
-from magnetosuture_thread.workers import Log, Progress
 
 SHOWN = 4  # instants of each run
 

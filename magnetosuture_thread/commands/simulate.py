@@ -18,11 +18,11 @@ from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.evaluation.metrics import finite_or_none
+from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.tables import loop_table, outcome_line
+from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.planning.procedure import read_procedure
@@ -30,8 +30,7 @@ from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
-from magnetosuture_thread.settings.resources import find_procedure_file, find_scene_file
-from magnetosuture_thread.workers import Log, Progress
+from magnetosuture_thread.settings.files import find_file, whole_folder
 
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
@@ -247,11 +246,11 @@ class _Procedure:
     def __init__(self, name: str, setup: Setup) -> None:
         procedure = read_procedure(name)
         setup.planner.planner(setup.scene).check(procedure)
-        scene = ("-p", f"scene:={find_scene_file(procedure.scene).resolve()}") if procedure.scene else ()
+        scene = ("-p", f"scene:={find_file('scene', procedure.scene).resolve()}") if procedure.scene else ()
         self.arguments = (*scene, *live.FORECAST)
         self.result: dict[str, Any] = {"procedure": procedure.name, "state": "not begun", "reason": "", "goals_met": 0}
         self.result |= {"goals": len(procedure.goals), "min_clearance_m": None}
-        self.client = clients.ProcedureClient(str(find_procedure_file(name).resolve()))
+        self.client = clients.ProcedureClient(str(find_file("procedure", name).resolve()))
 
     def poll(self, recorder: clients.Recorder) -> str:
         """Take what is new; return nothing, as what goes wrong is in the result."""

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -24,20 +24,19 @@ from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.recorded import read_image
-from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
+from magnetosuture_thread.evaluation.metrics import SensorSilence
+from magnetosuture_thread.evaluation.recorded import read_image
+from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.geometry.thread_observation import ThreadPiece
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
-from magnetosuture_thread.settings.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
+from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES, Channel
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_region
 from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
 from magnetosuture_thread.vision.video import VIDEOS, Video
-from magnetosuture_thread.workers import Log
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
@@ -84,15 +83,16 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     Where no frame shows a needle the command fails.
     """
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
-    view: dict[str, Any] = {} if options.metres_per_pixel is None else {"metres_per_pixel": options.metres_per_pixel}
-    if options.centre is not None:
-        view["dish_centre_px"] = tuple(options.centre)
-    if options.region is not None:
-        view["region_px"] = tuple(options.region)
-    view |= {"rim": options.rim} if options.rim else {}
-    view |= {"max_needle_brightness": options.needle_brightness} if options.needle_brightness else {}
-    settings = replace(setup.vision, **view)
-    source = FrameSource(options, terminal.log)
+    view = {
+        "metres_per_pixel": options.metres_per_pixel,
+        "dish_centre_px": tuple(options.centre or ()),
+        "region_px": tuple(options.region or ()),
+        "rim": options.rim,
+        "max_needle_brightness": options.needle_brightness,
+    }
+    chosen: dict[str, Any] = {name: value for name, value in view.items() if value}
+    settings = replace(setup.vision, **chosen)
+    source = open_frames(options, terminal.log)
     if source.is_sequence and source.names:
         how = f"read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
         terminal.log(f"{options.frames[0]} is {how}")
@@ -100,26 +100,24 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     if options.tip is not None:
         tracker.point_at_tip(np.array(options.tip))
     warm_up()
-    rows = []
+    rows: list[dict[str, Any]] = []
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
     files = numbered([Path(name).stem for name in source.names], "{}_{}")
     with (
         terminal.progress("track") as advance,
         nullcontext() if options.overlay is None else OverlayWriter(options.overlay, source.rate()) as writer,
     ):
-        for index, frame in enumerate(source):
+        for index, frame in enumerate(source.frames):
             tracker.set_lens(frame.lens)
             began = time.thread_time()
-            seen = _look(tracker, frame, source.is_sequence)
-            unverified = {"unverified": source.unverified} if source.unverified else {}
-            rows.append(_row(frame, seen, time.thread_time() - began) | unverified)
+            track = _look(tracker, frame, source.is_sequence)
+            rows.append(_row(frame, track, time.thread_time() - began))
+            if source.unverified:
+                rows[-1]["unverified"] = source.unverified
             if writer is not None and frame.image is not None:
-                picture = frame.image
-                if frame.lens is not None and frame.lens.problem_with(picture.shape) is None:
-                    picture = frame.lens.undistorted(picture)
-                drawn = draw_overlay(picture, seen, settings.needle_length, frame.name)
-                if seen.view is not None:
-                    draw_dish(drawn, seen.view.centre_px, setup.scene.dish.radius / seen.view.metres_per_pixel)
+                drawn = draw_overlay(frame.undistorted(), track, settings.needle_length, frame.name)
+                if track.view is not None:
+                    draw_dish(drawn, track.view.centre_px, setup.scene.dish.radius / track.view.metres_per_pixel)
                 draw_region(drawn, settings.region_px)
                 writer.write(files[index] if files else f"frame_{index:06d}", drawn)
             advance((index + 1) / max(source.count, 1))
@@ -140,8 +138,7 @@ class FrameFile:
     """One frame.
 
     Attributes:
-        name: the file's, with its folders where two have the same, numbered where a file is given twice; or topic or
-            video and stamp.
+        name: the file's, with its folders where two have the same; or topic or video and stamp.
         image: None if it is broken.
         problem: why it is; else empty.
         stamp: when it was taken [s], of a video or folder after its first frame; None where nothing tells.
@@ -154,87 +151,50 @@ class FrameFile:
     stamp: float | None = None
     lens: Lens | None = None
 
+    @property
+    def lens_problem(self) -> InvalidInputError | None:
+        """Return why the lens is not that of the image; None if it is, or there is none."""
+        return None if self.lens is None or self.image is None else self.lens.problem_with(self.image.shape)
 
+    def undistorted(self) -> np.ndarray:
+        """Return the image, which must be there, without the lens's distortion where the lens can be used."""
+        assert self.image is not None
+        return self.image if self.lens is None or self.lens_problem else self.lens.undistorted(self.image)
+
+
+@dataclass
 class FrameSource:
-    """The frames at given paths: pictures in the order given, those of a folder by name, of a video or bag by time.
-
-    Args:
-        options: of `command.add_frames`.
-        log: called with a line for a person on what of a bag is damaged or not checked.
+    """The frames at some paths: pictures in their order, those of a folder by name, of a video or bag by time.
 
     Attributes:
-        count: number of frames.
-        names: of picture files; empty for a bag or video.
+        frames: to go through once.
+        count: number of frames, as far as it is known before.
+        rate: returns the frame rate [1/s].
         is_sequence: whether the frames follow one another in time: those of a bag, a video, or one folder of pictures
             of one size.
+        names: of picture files; empty for a bag or video.
         unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
-        problems: why frames that were gone through could not be taken, with their number.
-
-    Raises:
-        BagError: a path does not exist, a folder holds no pictures, or a bag or video cannot be used.
-        InvalidInputError: the lens cannot be used.
+        refused: why frames that were gone through could not be taken, with their number.
+        remarks: on the frames that were taken.
     """
 
-    def __init__(self, options: argparse.Namespace, log: Log) -> None:
-        paths: list[Path] = options.frames
-        self._path = paths[0]
-        self._lens = read_lens(options.camera_info) if options.camera_info is not None else None
-        self._files: list[Path] = []
-        self._recording: Recording | None = None
-        self._video: Video | None = None
-        self._lens_problems: Counter[str] = Counter()
-        self.problems: Counter[str] = Counter()
-        self.count, self.unverified, self._rate = 0, "", options.rate or 30.0
-        for path in paths:
-            inside = _files_at(path)
-            is_video = path.suffix.lower() in VIDEOS and not path.is_dir()
-            is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside))
-            if not (is_bag or is_video):
-                self._files += inside
-                self.count = len(self._files)
-            elif len(paths) > 1:
-                raise BagError(path, f"is a {'bag' if is_bag else 'video'}; expected it alone, without other frames")
-            elif is_bag:
-                self._open(Bag(path, remap=dict(options.remap)), log)
-            else:
-                self._video = Video(path, options.rate)
-                self._rate, self.count = self._video.rate, self._video.count
-        is_folder = len(paths) == 1 and len(self._files) > 1 and paths[0].is_dir() and _of_one_size(self._files)
-        self.is_sequence = is_folder or not self._files
-        if options.remap and self._recording is None:
-            raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
-        if options.rate is not None and not (is_folder or self._video):
-            raise BagError(paths[0], "is no video and no folder of frames of one size, so --rate has no meaning for it")
-        names = [file.name for file in self._files]
-        unique = len(set(names)) == len(names)
-        self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
+    frames: Iterator[FrameFile] = field(default_factory=lambda: iter(()))
+    count: int = 0
+    rate: Callable[[], float] = lambda: 30.0
+    is_sequence: bool = True
+    names: Sequence[str] = ()
+    unverified: str = ""
+    refused: Counter[str] = field(default_factory=Counter)
+    remarks: set[str] = field(default_factory=set)
 
-    def _open(self, bag: Bag, log: Log) -> None:
-        recording = self._recording = Recording(bag)
-        self.unverified = bag.unverified
-        doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
-        for line in (str(bag.damage or ""), doubt, *recording.remarks):
-            if line:
-                log(f"{recording.path} {line}")
-        if recording.camera is None:
-            topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
-            problem = f"holds no camera frames; expected some on {topics}; its topics: {present}"
-            raise BagError(recording.path, problem)
-        if recording.rectified and self._lens is not None:
-            raise BagError(recording.path, f"has rectified frames on {recording.rectified}; omit --camera-info")
-        self.count = recording.counts[recording.camera.recorded]
+    def log_refused(self, log: Log) -> None:
+        """Log why frames could not be taken, once all have been gone through."""
+        for reason, count in self.refused.items():
+            log(f"{reason}: {pluralize(count, 'frame')} left out")
+        for remark in self.remarks:
+            log(remark)
 
-    def __iter__(self) -> Iterator[FrameFile]:
-        """Go through the frames."""
-        if self._recording is not None:
-            yield from self._recorded(self._recording)
-        if self._video is not None:
-            yield from self._filmed(self._video)
-        for index, (name, file) in enumerate(zip(self.names, self._files, strict=True)):
-            stamp = index / self._rate if self.is_sequence else None
-            yield self._frame(name, partial(_read_picture, file), stamp, self._lens)
-
-    def _frame(self, name: str, read: Callable[[], np.ndarray], stamp: float | None, lens: Lens | None) -> FrameFile:
+    def read(self, name: str, read: Callable[[], np.ndarray], stamp: float | None, lens: Lens | None) -> FrameFile:
         """Return a frame, or why it cannot be read."""
         try:
             return FrameFile(name, read(), "", stamp, lens)
@@ -242,51 +202,102 @@ class FrameSource:
             problem = f"cannot be read: {error.strerror}"
         except (BagError, InvalidInputError) as error:
             problem = str(error)
-        self.problems[problem] += 1
+        self.refused[problem] += 1
         return FrameFile(name, None, problem, stamp, lens)
 
-    def _filmed(self, video: Video) -> Iterator[FrameFile]:
-        found = 0
-        for stamp, image in video.frames():
-            found += 1
-            yield FrameFile(f"{self._path.name} {stamp:.6f}", image, "", stamp, self._lens)
-        if found < self.count:
-            self.problems[f"{self._path} is damaged"] += self.count - found
 
-    def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
-        lens: Lens | None = None
-        recording.refused.clear()  # counted by `rate` too
-        wanted = [channel for channel in (CAMERA_INFO, recording.camera) if channel is not None]
-        for record in recording.records([channel for channel in wanted if recording.counts.get(channel.recorded)]):
-            if record.topic == CAMERA_INFO.recorded:
-                try:
-                    lens = lens_of(record.decode())
-                except (BagError, InvalidInputError) as error:
-                    lens = None
-                    self._lens_problems[str(error)] += 1
-                continue
-            stamp = stamp_of(record) * 1e-9
-            name = f"{record.topic} {stamp:.6f}"
-            yield self._frame(name, partial(read_image, record), stamp, self._lens or lens)
+def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
+    """Open the frames that the options of `command.add_frames` name.
 
-    def log_refused(self, log: Log) -> None:
-        """Log why frames could not be taken, once all have been gone through."""
-        refused = self._recording.refused if self._recording is not None else Counter[str]()
-        for reason, count in (refused + self.problems).items():
-            log(f"{reason}: {pluralize(count, 'frame')} left out")
-        for problem in self._lens_problems:
-            log(f"{problem}: frames are taken as they are")
+    Args:
+        options: of the command.
+        log: called with a line for a person on what of a bag is damaged or not checked.
 
-    def rate(self) -> float:
-        """Return the frame rate; of a bag by the median interval of its first frames' stamps."""
-        if self._recording is None or self._recording.camera is None:
-            return self._rate
-        stamps = [stamp_of(record) for record in islice(self._recording.records([self._recording.camera]), 300)]
-        intervals = np.diff(stamps) * 1e-9
-        if not np.any(intervals > 0.0):
-            return 30.0
-        # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
-        return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
+    Raises:
+        BagError: a path does not exist, a folder holds no pictures, or a bag or video cannot be used.
+        InvalidInputError: the lens cannot be used.
+    """
+    lens = read_lens(options.camera_info) if options.camera_info is not None else None
+    paths: list[Path] = options.frames
+    path, files = paths[0], [file for path in paths for file in _files_at(path)]
+    is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (*paths, *files))
+    is_video = any(path.suffix.lower() in VIDEOS and not path.is_dir() for path in paths)
+    is_folder = not is_bag and len(paths) == 1 and len(files) > 1 and _of_one_size(files)
+    if (is_bag or is_video) and len(paths) > 1:
+        raise BagError(path, f"is beside a {'bag' if is_bag else 'video'}; expected that alone, without other frames")
+    if options.remap and not is_bag:
+        raise BagError(path, "is no bag, so there is no topic in it to remap")
+    if options.rate is not None and not (is_folder or is_video):
+        raise BagError(path, "is no video and no folder of frames of one size, so --rate has no meaning for it")
+    source = FrameSource(is_sequence=is_bag or is_video or is_folder)
+    if is_bag:
+        recording, camera = _open_recording(Bag(path, remap=dict(options.remap)), log)
+        if recording.rectified and lens is not None:
+            raise BagError(path, f"has rectified frames on {recording.rectified}; omit --camera-info")
+        source.count, source.unverified = recording.counts[camera.recorded], recording.unverified
+        source.rate = partial(_median_rate, recording, camera)
+        source.frames = _recorded(source, recording, camera, lens)
+    elif is_video:
+        video = Video(path, options.rate)
+        source.count, source.rate = video.count, lambda: video.rate
+        source.frames = _filmed(source, path, video, lens)
+    else:
+        rate, names = options.rate or 30.0, [file.name for file in files]
+        source.count, source.rate = len(files), lambda: rate
+        source.names = names if len(set(names)) == len(names) else list(map(str, files))
+        source.frames = (
+            source.read(name, partial(_read_picture, file), index / rate if is_folder else None, lens)
+            for index, (name, file) in enumerate(zip(source.names, files, strict=True))
+        )
+    return source
+
+
+def _open_recording(bag: Bag, log: Log) -> tuple[Recording, Channel]:
+    """Return a bag with its camera, and log what is unusual about it."""
+    recording = Recording(bag)
+    doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
+    for line in (str(bag.damage or ""), doubt, *recording.remarks):
+        if line:
+            log(f"{recording.path} {line}")
+    if recording.camera is None:
+        topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+        raise BagError(bag.path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
+    return recording, recording.camera
+
+
+def _filmed(source: FrameSource, path: Path, video: Video, lens: Lens | None) -> Iterator[FrameFile]:
+    count = 0
+    for stamp, image in video.frames():
+        count += 1
+        yield FrameFile(f"{path.name} {stamp:.6f}", image, "", stamp, lens)
+    if count < source.count:
+        source.refused[f"{path} is damaged"] += source.count - count
+
+
+def _recorded(source: FrameSource, recording: Recording, camera: Channel, override: Lens | None) -> Iterator[FrameFile]:
+    lens: Lens | None = None
+    channels = [channel for channel in (CAMERA_INFO, camera) if recording.counts.get(channel.recorded)]
+    recording.refused.clear()  # counted by the rate too
+    for record in recording.records(channels):
+        if record.topic == CAMERA_INFO.recorded:
+            try:
+                lens = lens_of(record.decode())
+            except (BagError, InvalidInputError) as error:
+                lens = None
+                source.remarks.add(f"{error}: frames are taken as they are")
+            continue
+        stamp = stamp_of(record) * 1e-9
+        yield source.read(f"{record.topic} {stamp:.6f}", partial(read_image, record), stamp, override or lens)
+    source.refused.update(recording.refused)
+
+
+def _median_rate(recording: Recording, camera: Channel) -> float:
+    """Return the frame rate by the median interval of a bag's first frames' stamps [1/s]."""
+    intervals = 1e-9 * np.diff([stamp_of(record) for record in islice(recording.records([camera]), 300)])
+    if not np.any(intervals > 0.0):
+        return 30.0
+    # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
+    return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -366,12 +377,9 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
     names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
     pose: dict[str, Any] = dict.fromkeys(names)
     if not track.reason:
-        thread, angle = track.centreline, math.atan2(track.heading[1], track.heading[0])
-        pose["tail_m"], pose["heading_rad"] = _numbers(track.tail), finite_or_none(angle)
-        pose["tip_m"], pose["curvature_per_m"] = _numbers(track.tip), finite_or_none(float(track.curvature))
-        pose["thread_m"] = thread.tolist() if np.isfinite(thread).all() else None
-        pose["pieces"] = [_piece(piece) for piece in track.observation.pieces]
-    length = track.needle_length
+        angle, pieces = np.arctan2(track.heading[1], track.heading[0]), map(_piece, track.observation.pieces)
+        values = (track.tail, angle, track.tip, np.float64(track.curvature), track.centreline)
+        pose = dict(zip(names, (*map(_finite, values), list(pieces)), strict=True))
     return {
         "file": frame.name,
         "status": track.state.value,
@@ -382,16 +390,17 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         "metres_per_pixel": None if track.view is None else track.view.metres_per_pixel,
         "scale_doubt": None if track.view is None else track.scale_error,
         **pose,
-        "needle_length_m": None if length is None else finite_or_none(float(length)),
+        "needle_length_m": None if track.needle_length is None else _finite(np.float64(track.needle_length)),
         "complete": track.observation.complete,
-        "confidence": finite_or_none(float(track.confidence)),
+        "confidence": _finite(np.float64(track.confidence)),
         "time_s": duration,
         "stamp_s": frame.stamp,
     }
 
 
-def _numbers(values: np.ndarray) -> list[float] | None:
-    return [float(value) for value in values] if np.isfinite(values).all() else None
+def _finite(values: np.ndarray | np.float64) -> Any:
+    """Return a number, or an array as lists; None where any of it is not finite."""
+    return values.tolist() if np.isfinite(values).all() else None
 
 
 def _piece(piece: ThreadPiece) -> dict[str, Any]:
@@ -401,7 +410,7 @@ def _piece(piece: ThreadPiece) -> dict[str, Any]:
         "deviation_m": piece.deviation.tolist(),
         "first_end": piece.first_end.name.lower(),
         "last_end": piece.last_end.name.lower(),
-        "arc_length_m": [finite_or_none(float(value)) for value in piece.arc_length],
+        "arc_length_m": [_finite(np.float64(value)) for value in piece.arc_length],
         "direction_known": piece.direction_known,
         "confidence": piece.confidence,
     }
@@ -411,18 +420,15 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return a row for each of the first frames, as `_row` gives them."""
     began, lines = rows[0]["stamp_s"] if rows else None, []
     for row in rows[:20]:
-        cells = ["", "", "", ""]
-        if not row["reason"]:
-            length = np.linalg.norm(np.diff(np.reshape(row["thread_m"] or [], (-1, 2)), axis=0), axis=1).sum()
-            cells = [
-                ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
-                "" if row["heading_rad"] is None else f"{math.degrees(row['heading_rad']):.1f}",
-                "" if row["thread_m"] is None else f"{1e3 * length:.1f}",
-                "" if row["confidence"] is None else f"{row['confidence']:.2f}",
-            ]
         name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
-        status = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
-        lines.append((name, status, *cells, f"{row['time_s'] * 1e3:.1f}"))
+        cells = [""] * 4
+        if row["tail_m"] and row["heading_rad"] is not None:
+            steps = np.diff(np.reshape(row["thread_m"] or [], (-1, 2)), axis=0)
+            x, y, heading = 1e3 * row["tail_m"][0], 1e3 * row["tail_m"][1], math.degrees(row["heading_rad"])
+            length = f"{1e3 * np.hypot(*steps.T).sum():.1f}" if len(steps) else ""
+            cells = [f"{x:.2f}, {y:.2f}", f"{heading:.1f}", length, f"{row['confidence']:.2f}"]
+        status = ": ".join(filter(None, (row["status"], row["reason"])))
+        lines.append((name, status, *cells, f"{1e3 * row['time_s']:.1f}"))
     if len(rows) > 20:
         lines.append((f"and {len(rows) - 20} more", "", "", "", "", "", ""))
     caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"

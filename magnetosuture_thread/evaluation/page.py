@@ -19,7 +19,7 @@ from magnetosuture_thread.evaluation import figures as report
 from magnetosuture_thread.evaluation.figures import AGAINST, COLOURS, STAGES, BagDetails, Figures
 from magnetosuture_thread.evaluation.frames import MARGIN, Array, ErrorMap, WorstFrame, with_gaps
 from magnetosuture_thread.evaluation.metrics import Consistency, Percentiles, RunMetrics
-from magnetosuture_thread.settings.texts import printable
+from magnetosuture_thread.settings.errors import printable
 from magnetosuture_thread.thread.margins import SOLID
 
 if TYPE_CHECKING:

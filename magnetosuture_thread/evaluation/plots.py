@@ -30,7 +30,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import KINDS, Scene
-from magnetosuture_thread.settings.texts import printable
+from magnetosuture_thread.settings.errors import printable
 
 SEEN, TRUTH, PREDICTED, ESTIMATED = (light for light, _ in COLOURS.values())
 INK, FAINT = TRUTH, "#7b8794"

@@ -16,17 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
+from magnetosuture_thread.evaluation.workers import Progress
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
 from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.program import SOLVED
-from magnetosuture_thread.workers import Progress
 
 # What numpy and json raise on files that are something else.
 NOT_ONE = (

@@ -34,7 +34,7 @@ from magnetosuture_thread.evaluation.metrics import (
 )
 from magnetosuture_thread.evaluation.reference import Evaluation
 from magnetosuture_thread.geometry.barrier import BUILT_IN
-from magnetosuture_thread.settings.texts import printable
+from magnetosuture_thread.settings.errors import printable
 
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"

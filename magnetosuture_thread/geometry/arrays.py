@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.settings.configuration import Quantity
-from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.texts import shortened
+from magnetosuture_thread.settings.errors import InvalidInputError, shortened
 
 
 def as_numbers(name: str, value: Any) -> NDArray[np.float64]:

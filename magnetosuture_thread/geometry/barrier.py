@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.configuration import Quantity
-from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.settings.texts import shortened
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, shortened
 
 NO_OBSTACLE = -1
 CONNECTIVITY, COMPRESSION, OBSTACLE = "connectivity", "compression", "obstacle"

@@ -41,10 +41,7 @@ from magnetosuture_thread.geometry.scene_shapes import (
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import read_yaml
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.outputs import output_problem
-from magnetosuture_thread.settings.resources import find_scene_file
-from magnetosuture_thread.settings.untrusted import MAX_TEXT_BYTES
+from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, find_file, output_problem, read_regular
 
 GEOJSON_ENDINGS = (".json", ".geojson")
 DISH = "dish"  # kind of the feature that is the dish
@@ -56,10 +53,10 @@ def read_scene(name: str) -> Scene:
     """Read a scene, given as a path or as the name of one that ships with the package.
 
     Raises:
-        ConfigurationError: there is no such file, it is no regular file of at most 1 MB, or it holds anything
+        ConfigurationError: there is no such file, it is no regular file of at most 4 MB, or it holds anything
             invalid.
     """
-    path = find_scene_file(name)
+    path = find_file("scene", name)
     source = str(path)
     if path.suffix not in GEOJSON_ENDINGS:
         return scene_from_mapping(read_yaml(path, "scene file", plain=True), source)

@@ -36,9 +36,8 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reading import clock_nanoseconds, constant_name
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import JITTER_KEYS, MAX_REASON_CHARS, SCHEDULING, GuardedNode, read_status
-from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.errors import GraphError, shortened
 from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, Service
-from magnetosuture_thread.settings.texts import shortened
 
 TIMEOUT = 10.0  # s for a service to be found and to answer
 POLL_PERIOD = 0.005  # s between two looks at what has come

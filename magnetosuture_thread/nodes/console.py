@@ -35,10 +35,9 @@ from magnetosuture_thread.nodes.run import end_signals
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.settings import interface
-from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.errors import GraphError, shortened
+from magnetosuture_thread.settings.files import shipped_names
 from magnetosuture_thread.settings.interface import Service
-from magnetosuture_thread.settings.resources import shipped_procedures
-from magnetosuture_thread.settings.texts import shortened
 from magnetosuture_thread.vision.images import image_of
 
 NAME = "console"
@@ -107,7 +106,7 @@ class ConsoleGraph:
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
         self._tips = topics.NEEDLE_TIP.publisher(node)
-        self._procedures = {name: read_procedure(name).shape_names for name in shipped_procedures()}
+        self._procedures = {name: read_procedure(name).shape_names for name in shipped_names("procedure")}
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
         self._open(settings, _file_scene(settings))

@@ -16,7 +16,7 @@ from magnetosuture_thread.bags.reading import constant_name, heading_known, marg
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
-from magnetosuture_thread.settings.texts import shortened
+from magnetosuture_thread.settings.errors import shortened
 from magnetosuture_thread.thread.margins import node_clearance
 
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts

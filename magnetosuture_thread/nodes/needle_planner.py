@@ -39,8 +39,8 @@ from magnetosuture_thread.planning.session import (
     compile_planning,
 )
 from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import shortened
 from magnetosuture_thread.settings.interface import Service
-from magnetosuture_thread.settings.texts import shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
 

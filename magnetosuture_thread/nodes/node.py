@@ -37,8 +37,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.parameters import declare, plain_value
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
-from magnetosuture_thread.settings.errors import GraphError
-from magnetosuture_thread.settings.texts import shortened
+from magnetosuture_thread.settings.errors import GraphError, shortened
 
 C = TypeVar("C", bound=Configuration)
 E = TypeVar("E")  # a publisher, subscription, service or timer, or another part of a node with a method `destroy`

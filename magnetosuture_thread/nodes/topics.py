@@ -22,8 +22,8 @@ from rclpy.subscription import Subscription
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.files import MAX_FILE_BYTES
 from magnetosuture_thread.settings.interface import Channel, Quality
-from magnetosuture_thread.settings.untrusted import MAX_BLOCK_BYTES
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.node import GuardedNode
@@ -47,7 +47,7 @@ MAX_BYTES = {
         for name in ("TrackerState", "FilterState", "CoilBridgeState", "ProcedureState", "CoilCurrents")
     },
     "diagnostic_msgs": 1 << 16,
-    "sensor_msgs": MAX_BLOCK_BYTES,
+    "sensor_msgs": MAX_FILE_BYTES,
     "visualization_msgs": 1 << 22,
     **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
 }

@@ -29,7 +29,7 @@ from magnetosuture_thread.settings.configuration import (
     suggest_names,
 )
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.resources import find_procedure_file
+from magnetosuture_thread.settings.files import find_file
 
 MAX_GOALS = 100
 HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`
@@ -398,7 +398,7 @@ def read_procedure(name: str) -> Procedure:
     Raises:
         ConfigurationError: there is no such file, it cannot be read, or is no procedure.
     """
-    path = find_procedure_file(name)
+    path = find_file("procedure", name)
     found = parse_procedure(read_yaml(path, "procedure"), path.stem, str(path))
     return replace(found, setup=_beside(path, found.setup), scene=_beside(path, found.scene))
 

@@ -19,8 +19,8 @@ from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.settings.configuration import Configuration, errors_of_file
 from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.files import find_file
 from magnetosuture_thread.settings.parameter_files import EVERY_NODE, load_setup
-from magnetosuture_thread.settings.resources import find_setup_file
 from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
@@ -97,7 +97,7 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
     Raises:
         ConfigurationError: there is no such file, or it holds anything invalid.
     """
-    path = find_setup_file(name)
+    path = find_file("setup", name)
     settings = load_setup(path, (*SETTINGS_CLASSES, SceneServerSettings))
     with errors_of_file(str(path)):
         _check_agreement(settings)

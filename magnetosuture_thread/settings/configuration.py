@@ -24,8 +24,7 @@ from typing import Any, ClassVar, TypeVar, cast, get_args, get_origin, get_type_
 import yaml
 
 from magnetosuture_thread.settings.errors import MAX_NAME_CHARS, ConfigurationError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
+from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml, read_regular
 
 C = TypeVar("C", bound="Configuration")
 

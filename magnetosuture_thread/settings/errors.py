@@ -1,4 +1,4 @@
-"""Errors with the value that was given, where, and what was expected."""
+"""Errors with the value that was refused, where, and what was expected; texts from outside as they may be shown."""
 
 from __future__ import annotations
 
@@ -6,15 +6,42 @@ import copyreg
 import re
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
 from typing import Any
 
-from magnetosuture_thread.settings.texts import shortened
-
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
-
+MAX_CHARS = 100  # of a text from outside, wherever it is stored, logged, published or drawn
 
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
 _ROS = re.compile(r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|rosidl)_?.*|.+_(msgs|srvs|interfaces)(_py)?")
+
+
+def printable(text: str) -> str:
+    r"""Return a text without control characters, characters that turn its direction, and what no encoding has.
+
+    A name in a bag or of a file may hold any of them; each becomes its escape sequence. Line feeds and tabs stay.
+
+    >>> printable("a\x1b[31m")
+    'a\\x1b[31m'
+    """
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() or sign in "\n\t" else ascii(sign)[1:-1] for sign in text)
+
+
+def one_line(text: str) -> str:
+    """Return a name as `printable`, in one line."""
+    return printable(text).replace("\n", "\\n").replace("\t", "\\t")
+
+
+def shortened(text: str, max_chars: int = MAX_CHARS) -> str:
+    """Return a text from outside as `one_line`, of at most so many characters.
+
+    >>> shortened("frame" * 1000, 12)
+    'frameframef…'
+    """
+    line = one_line(text[: max_chars + 1])
+    return line if len(line) <= max_chars else line[: max_chars - 1] + "…"
 
 
 def missing_module(error: ModuleNotFoundError) -> str:
@@ -74,6 +101,20 @@ class BagError(MagnetosutureError):
         self.path = str(path)
         self.problem = problem
         super().__init__(f"{path}: {problem}")
+
+
+class RecordingEndedError(BagError):
+    """The disk is full, or fails; what was recorded before can be read.
+
+    Args:
+        folder: of the bag.
+        cause: what ended it.
+        file: that holds what was recorded before.
+    """
+
+    def __init__(self, folder: Path, cause: str, file: Path) -> None:
+        self.cause, self.file = cause, file
+        super().__init__(folder, f"{cause}; what was recorded before can be read: {file}")
 
 
 class InvalidInputError(MagnetosutureError):

@@ -30,7 +30,7 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.untrusted import MAX_PIXELS
+from magnetosuture_thread.settings.files import MAX_PIXELS
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
 BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line

@@ -14,8 +14,7 @@ import numpy as np
 import yaml
 
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.files import read_regular
-from magnetosuture_thread.settings.untrusted import BudgetError, check_yaml
+from magnetosuture_thread.settings.files import BudgetError, check_yaml, read_regular
 
 COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 ALIASES = {

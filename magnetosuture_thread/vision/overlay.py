@@ -13,7 +13,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.outputs import output_problem
+from magnetosuture_thread.settings.files import output_problem
 from magnetosuture_thread.vision.tracker import State, Track
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.untrusted import MAX_PIXELS
+from magnetosuture_thread.settings.files import MAX_PIXELS
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv")  # endings
 

@@ -16,12 +16,13 @@ import s3fs
 from werkzeug.serving import make_server
 
 from magnetosuture_thread import cli
+from magnetosuture_thread.bags.budgets import RANGE_BYTES, open_ranges
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
 from magnetosuture_thread.evaluation.tables import TIMES
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import RANGE_BYTES, open_ranges, parse_location
+from magnetosuture_thread.settings.files import parse_location
 from test.bags.bags import (
     IMAGE,
     SECOND,

@@ -28,51 +28,34 @@ def probe(folder: Path, reach: float = 0.015, background: float = 3e-5) -> Path:
     return path
 
 
-def test_a_calibration_is_written_that_the_bridge_takes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv("COLUMNS", "120")
+def test_a_calibration_is_written_that_the_bridge_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     output = tmp_path / "rig_7.yaml"
-    measurements = probe(tmp_path)
-    assert cli.main(["calibrate-coils", str(measurements), "--output", str(output)]) == 0
+    assert cli.main(["calibrate-coils", str(probe(tmp_path)), "--output", str(output)]) == 0
     shown = capsys.readouterr().out
-    assert "coils as loops" in shown
-    assert "coil_3" in shown
-    assert "100 readings, residual" in shown
-    assert "is in line" in shown
-    assert str(output) in shown
+    for words in ("coils as loops", "coil_3", "100 readings, residual", "is in line"):
+        assert words in shown
     written = read_calibration(output)
-    assert written.name == "rig_7"
+    assert (written.name, len(written.date)) == ("rig_7", 10)
     assert "100 readings in probe.csv" in written.notes
-    assert len(written.date) == 10
     settings = CoilBridgeSettings(calibration=str(output))
     for coil, angle in zip(settings.coils_properties(), ANGLES, strict=True):
         assert np.cos(coil.angle - angle) == pytest.approx(1.0, abs=1e-3)
         assert coil.distance == pytest.approx(0.052, rel=0.1)
         assert coil.field_per_current == pytest.approx(1.1e-3, rel=0.02)
-    point = np.array([0.008, -0.006])
-    truth = LoopCoils(coils_around(ANGLES, 0.052, 0.024, 1.1e-3)).per_current(point)
-    np.testing.assert_allclose(LoopCoils(written.coils).per_current(point), truth, atol=2e-5)
 
 
 def test_what_fails_leaves_the_calibration_before(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     output, measurements = tmp_path / "rig.yaml", probe(tmp_path)
     output.write_text("before")
-    text = measurements.read_text().splitlines()
-    text[7] = "0,2.0,0.001,0.001,1000.0,0.0"
-    measurements.write_text("\n".join(text))
-    assert cli.main(["calibrate-coils", str(measurements), "--output", str(output)]) == 1
-    assert f"{measurements}, line 8, bx: got 1000.0, expected a number from -1 to 1 T" in capsys.readouterr().err
-    assert output.read_text() == "before"
+    lines = measurements.read_text().splitlines()
+    wrong = "\n".join([*lines[:7], "0,2.0,0.001,0.001,1000.0,0.0", *lines[8:]])
+    far = probe(tmp_path, background=2e-3).read_text()  # far above the earth's
+    for text, words in (
+        (wrong, f"{measurements}, line 8, bx: got 1000.0, expected a number from -1 to 1 T"),
+        (far, "are all fields in T"),
+    ):
+        measurements.write_text(text)
+        assert cli.main(["calibrate-coils", str(measurements), "--output", str(output)]) == 1
+        assert words in capsys.readouterr().err
+        assert output.read_text() == "before"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["probe.csv", "rig.yaml"]
-
-
-def test_what_cannot_be_a_calibration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = probe(tmp_path)
-    before = path.read_text()
-    assert cli.main(["calibrate-coils", str(path), "--output", str(path)]) == 2
-    assert path.read_text() == before
-    path = probe(tmp_path, background=2e-3)  # far above the earth's
-    assert cli.main(["calibrate-coils", str(path), "--output", str(tmp_path / "rig.yaml")]) == 1
-    assert "are all fields in T" in capsys.readouterr().err
-    assert not (tmp_path / "rig.yaml").exists()

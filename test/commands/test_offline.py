@@ -24,9 +24,9 @@ from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.recorded import BagInput, ObservationReader, chosen_source, predictions
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.commands.replay import replay_offline
+from magnetosuture_thread.evaluation.recorded import BagInput, ObservationReader, chosen_source, predictions
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Scene, SceneShape

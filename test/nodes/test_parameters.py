@@ -23,7 +23,7 @@ from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import configuration_fields, to_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.resources import find_setup_file
+from magnetosuture_thread.settings.files import find_file
 from test.test_configuration import Oven
 
 
@@ -173,7 +173,7 @@ def test_parameters_that_are_dumped_are_loaded_again_and_started_with(graph, tmp
         arguments = ["--ros-args", "--params-file", str(file)]
         return graph.add(lambda context, **_: ThreadModelNode(context=context, cli_args=arguments))
 
-    node, file = started(find_setup_file("hernia_ring")), tmp_path / "dumped.yaml"
+    node, file = started(find_file("setup", "hernia_ring")), tmp_path / "dumped.yaml"
     name = node.get_fully_qualified_name()
     client = AsyncParameterClient(graph.probe, name)
     graph.wait(client.services_are_ready, "the parameter services")

@@ -14,7 +14,7 @@ from magnetosuture_thread.planning.procedure import Tighten, parse_procedure, re
 from magnetosuture_thread.rig.closed_loop import LATENCY
 from magnetosuture_thread.rig.setups import read_procedure_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.resources import share_directory
+from magnetosuture_thread.settings.files import share_directory
 from magnetosuture_thread.thread.prediction import NeedlePose
 
 FOLDER = share_directory("magnetosuture_thread") / "config" / "procedures"

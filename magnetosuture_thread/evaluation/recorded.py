@@ -36,6 +36,7 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_m
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
@@ -47,7 +48,6 @@ from magnetosuture_thread.settings.interface import Channel
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import lens_of
 from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession, warm_up
-from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
