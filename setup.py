@@ -15,15 +15,7 @@ def files(pattern: str) -> list[str]:
 setup(
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={
-        PACKAGE: [
-            "py.typed",
-            "commands/campaign.html",
-            "commands/campaign.css",
-            "evaluation/page.html",
-            "evaluation/page.css",
-            "evaluation/page.js",
-            "console/page/*",
-        ]
+        PACKAGE: ["py.typed", "console/page/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

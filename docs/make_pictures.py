@@ -17,7 +17,6 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-from playwright.sync_api import sync_playwright
 from procedure_animation import draw_procedure
 
 ROOT = Path(__file__).parents[1]
@@ -44,16 +43,9 @@ def demo(folder: Path) -> Path:
 
 
 def report(folder: Path) -> Path:
-    """Return the top of a page of `evaluate`, as a browser shows it."""
+    """Return the picture that `evaluate` draws of a bag."""
     magnetosuture("evaluate", BAG, "--output", folder / "evaluated")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 960, "height": 1560})
-        page.goto((folder / "evaluated" / f"{BAG.name}.html").as_uri())
-        page.wait_for_load_state("networkidle")
-        page.screenshot(path=folder / "report.jpg", type="jpeg", quality=85)
-        browser.close()
-    return folder / "report.jpg"
+    return (folder / "evaluated" / f"{BAG.name}.png").rename(folder / "report.png")
 
 
 def frames(folder: Path) -> Path:

@@ -45,26 +45,12 @@ from magnetosuture_thread.bags.storage import (
     parse_qos_profiles,
     pluralize,
 )
-from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
 DISK_FULL_TEXTS = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
-
-
-class RecordingEndedError(BagError):
-    """The disk is full, or fails; what was recorded before can be read.
-
-    Args:
-        folder: of the bag.
-        cause: what ended it.
-        file: that holds what was recorded before.
-    """
-
-    def __init__(self, folder: Path, cause: str, file: Path) -> None:
-        self.cause, self.file = cause, file
-        super().__init__(folder, f"{cause}; what was recorded before can be read: {file}")
 
 
 @dataclass

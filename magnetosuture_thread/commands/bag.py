@@ -14,7 +14,7 @@ from magnetosuture_thread.bags.check import inspect_bag, write_repaired_bag
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import pluralize, silence_text
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.texts import one_line
 
 DESCRIPTION = """\

@@ -22,11 +22,11 @@ from magnetosuture_thread.calibration.result import (
 )
 from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_file
-from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag, setup_of_notes
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.evaluation.recorded import BagInput, BagSelection, open_bag, setup_of_notes
 from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_file
 from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.commands.track import FrameSource
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_file
 from magnetosuture_thread.settings.texts import one_line
 from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

@@ -14,7 +14,7 @@ from rich.table import Table
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_file
+from magnetosuture_thread.settings.files import whole_file
 
 
 def add(parser: argparse.ArgumentParser) -> None:

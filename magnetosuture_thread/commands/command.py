@@ -191,7 +191,7 @@ def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def bag_selection(options: argparse.Namespace) -> dict[str, Any]:
-    """Return how a bag is read: see `commands.recorded.BagSelection`."""
+    """Return how a bag is read: see `evaluation.recorded.BagSelection`."""
     chosen = given(options, *(name for name in ("source", "start", "duration", "frame") if hasattr(options, name)))
     return {"setup_name": options.setup, "remap": dict(options.remap), **chosen}
 
@@ -293,7 +293,7 @@ def make_table(
 def write_json(path: Path | None, figures: Any) -> None:
     """Write figures to the file given by --json, if any."""
     if path:
-        from magnetosuture_thread.commands.output import whole_file  # late, as --help needs no bags
+        from magnetosuture_thread.settings.files import whole_file  # late, as --help needs no bags
 
         with whole_file(path) as partial:
             partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

@@ -20,10 +20,9 @@ from typing import Any
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.evaluation.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, joined
 from magnetosuture_thread.nodes.console import RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
@@ -32,6 +31,7 @@ from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.settings.resources import share_directory
 from magnetosuture_thread.workers import Log

@@ -16,8 +16,7 @@ import yaml
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands import recorded, replay
-from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.evaluation import recorded, replay
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, stage_latencies
 from magnetosuture_thread.geometry.scene_files import write_scene
@@ -29,6 +28,7 @@ from magnetosuture_thread.nodes.run import Interruption
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from magnetosuture_thread.bags import packing
 from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory, read_reference
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
@@ -23,6 +22,7 @@ from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_folder
 
 SIZE = (640, 480)
 EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "not set" in ROS

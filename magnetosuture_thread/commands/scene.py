@@ -11,8 +11,8 @@ from rich.table import Table
 
 from magnetosuture_thread import ConfigurationError, Disc, SceneShape, read_scene
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.geometry.scene_checks import scene_warnings
+from magnetosuture_thread.settings.files import whole_file
 
 DESCRIPTION = """\
 Check a scene file, or draw it.

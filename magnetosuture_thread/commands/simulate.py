@@ -18,10 +18,9 @@ from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.evaluation.metrics import finite_or_none
+from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.tables import loop_table, outcome_line
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.nodes import clients, topics
@@ -30,6 +29,7 @@ from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.workers import Log, Progress
 

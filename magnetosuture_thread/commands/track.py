@@ -24,8 +24,8 @@ from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
+from magnetosuture_thread.evaluation.recorded import read_image
 from magnetosuture_thread.geometry.thread_observation import ThreadPiece
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import BagError

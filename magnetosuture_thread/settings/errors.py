@@ -6,6 +6,7 @@ import copyreg
 import re
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
 from typing import Any
 
 from magnetosuture_thread.settings.texts import shortened
@@ -74,6 +75,20 @@ class BagError(MagnetosutureError):
         self.path = str(path)
         self.problem = problem
         super().__init__(f"{path}: {problem}")
+
+
+class RecordingEndedError(BagError):
+    """The disk is full, or fails; what was recorded before can be read.
+
+    Args:
+        folder: of the bag.
+        cause: what ended it.
+        file: that holds what was recorded before.
+    """
+
+    def __init__(self, folder: Path, cause: str, file: Path) -> None:
+        self.cause, self.file = cause, file
+        super().__init__(folder, f"{cause}; what was recorded before can be read: {file}")
 
 
 class InvalidInputError(MagnetosutureError):

@@ -99,7 +99,7 @@ import os, resource, signal, sys
 from pathlib import Path
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.settings.files import whole_folder
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
 try:

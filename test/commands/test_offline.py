@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
-from magnetosuture_thread import cli
+from magnetosuture_thread import cli, replay_offline
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import packed_compressed_image
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
@@ -24,9 +24,8 @@ from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.recorded import BagInput, ObservationReader, chosen_source, predictions
 from magnetosuture_thread.commands.render import render_bag
-from magnetosuture_thread.commands.replay import replay_offline
+from magnetosuture_thread.evaluation.recorded import BagInput, ObservationReader, Step, chosen_source, predictions
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Scene, SceneShape
@@ -157,7 +156,8 @@ def test_what_cannot_be_replayed_is_refused_and_nothing_is_left(pose_bag: Path, 
         with pytest.raises(BagError, match=words):
             replay_offline(bag, tmp_path / "out", **selection)
     assert not (tmp_path / "out").exists()
-    steps = list(predictions(observed(unseen), replace(SETUP.model, initial_shape="straight"), SETUP.scene))
+    straight = predictions(observed(unseen), replace(SETUP.model, initial_shape="straight"), SETUP.scene)
+    steps = [event for event in straight if isinstance(event, Step)]
     assert [step.result.prediction is not None for step in steps] == [True] * 30
 
 
@@ -288,7 +288,7 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
     bag = with_changes(pose_bag, tmp_path / "told", *changes, material="silk_6_0")
     for start, first in ((0.0, 12), (0.5, 0)):
         seen = observed(bag, start=start)
-        steps = list(predictions(seen, SETUP.model, SETUP.scene))
+        steps = [event for event in predictions(seen, SETUP.model, SETUP.scene) if isinstance(event, Step)]
         assert [step.scene for step in steps] == [SETUP.scene] * first + [scene] * (len(steps) - first)
         assert [step.result.scene_version for step in steps] == [step.scene.version for step in steps if step.scene]
         assert {step.settings.material for step in steps} == {SETUP.model.material, "silk_6_0"}

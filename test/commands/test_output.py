@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import whole_folder
 
 
 def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):

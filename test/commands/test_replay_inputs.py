@@ -14,7 +14,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.scene_message import packed_scene, parse_scene_message
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.live import GraphInput
-from magnetosuture_thread.commands.recorded import SETUP_NOTE, BagInput, open_bag
+from magnetosuture_thread.evaluation.recorded import SETUP_NOTE, BagInput, open_bag
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.geometry.scene_files import read_scene

@@ -20,7 +20,7 @@ from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.recorded import read_image
+from magnetosuture_thread.evaluation.recorded import read_image
 from magnetosuture_thread.settings.interface import COMPRESSED_IMAGE
 from magnetosuture_thread.vision.overlay import NEEDLE
 from test.bags.bags import copy_with_notes, make, stamped
