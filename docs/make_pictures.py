@@ -37,15 +37,9 @@ def magnetosuture(*words: str | Path) -> None:
 
 
 def demo(folder: Path) -> Path:
-    """Return the summary of a live replay."""
-    magnetosuture("replay", BAG, "--output", folder / "replay")
+    """Return the picture of a replay without a graph."""
+    magnetosuture("replay", BAG, "--offline", "--output", folder / "replay")
     return (folder / "replay" / "summary.png").rename(folder / "demo.png")
-
-
-def report(folder: Path) -> Path:
-    """Return the picture that `evaluate` draws of a bag."""
-    magnetosuture("evaluate", BAG, "--output", folder / "evaluated")
-    return (folder / "evaluated" / f"{BAG.name}.png").rename(folder / "report.png")
 
 
 def frames(folder: Path) -> Path:
@@ -114,7 +108,6 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     maker.__name__: maker
     for maker in (
         demo,
-        report,
         frames,
         calibration,
         own_barrier,

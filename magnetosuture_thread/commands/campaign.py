@@ -186,10 +186,10 @@ def draw_campaign(result: CampaignResult) -> bytes:
     title = f"{result.procedure.name} on {result.setup.name}, simulated: {result.successes} of {count} runs succeeded"
     words = "green: succeeded, red: failed; dashed: limit"
     if failed:
+        words += "; below: failed runs at their end, magenta: thread, black: needle of the last seconds,"
         words += (
-            "; below: failed runs at their end; magenta: thread, black: needle of the last seconds, red: where it was"
+            "\nred: where it was closest to wall or shape, orange: planned way of its middle, arrow: commanded velocity"
         )
-        words += " closest to wall or shape, orange: planned way of its middle, arrow: commanded velocity"
     for text, below, size in ((title, 0.15, 14), (words, 0.5, 9.5)):
         figure.text(0.015, 1.0 - below / height, text, fontsize=size, color=plots.INK, va="top", parse_math=False)
     colours = [plots.GOOD if each.success else plots.BAD for each in result.runs]
@@ -210,7 +210,7 @@ def draw_campaign(result: CampaignResult) -> bytes:
     for index, each in enumerate(failed):
         row, column = divmod(index, 4)
         axes = figure.add_axes((0.01 + 0.2475 * column, (3.6 * (rows - 1 - row) + 0.05) / height, 0.24, 3.1 / height))
-        axes.set_title(f"seed {each.seed}: {shortened(each.reason, 44)}", fontsize=9, color=plots.INK, loc="left")
+        axes.set_title(f"seed {each.seed}: {shortened(each.reason, 38)}", fontsize=9, color=plots.INK, loc="left")
         _draw_failed_run(axes, each, result)
     return plots.to_png(figure)
 
