@@ -168,6 +168,14 @@ class ObservationReader:
         """Yield the observations."""
         return (event for event in self.events() if isinstance(event, Observation))
 
+    @contextmanager
+    def counting(self, topic: str) -> Iterator[None]:
+        """Count a message that cannot be used as refused, as live, and go on."""
+        try:
+            yield
+        except MagnetosutureError as error:
+            self.refused[f"{topic}: {error}"] += 1
+
     def thread_problem(self) -> str:
         """Return a text if most of the measured threads are not of this setup; else empty."""
         if 2 * self._odd <= self._measured:
@@ -243,19 +251,15 @@ class ObservationReader:
     def _set_lens(self, record: RecordedMessage, tracker: TrackerSession) -> None:
         """Undo the distortion of a recorded lens from here on, as `vision_tracker` does."""
         lens = None
-        try:
+        with self.counting(record.topic):
             lens = lens_of(record.decode())
-        except MagnetosutureError as error:
-            self.refused[f"{record.topic}: {error}"] += 1
         tracker.set_lens(lens)
 
     def _set_tip(self, record: RecordedMessage, tracker: TrackerSession) -> None:
         """Set which end of the needle is its tip, as `vision_tracker` does."""
-        try:
+        with self.counting(record.topic):
             stamp = min(stamp_of(record), record.time) or record.time
             tracker.point_at_tip(plane_point(record.decode(), record.topic), stamp * 1e-9)
-        except MagnetosutureError as error:
-            self.refused[f"{record.topic}: {error}"] += 1
 
     def _keep(self, record: RecordedMessage) -> None:
         """Keep what belongs to a frame; nothing where it is not valid."""
@@ -361,10 +365,8 @@ def predictions(reader: ObservationReader, settings: ThreadModelSettings, scene:
     for event in reader.events():
         yield event
         if isinstance(event, RecordedMessage) and event.topic in (channel.recorded for channel in CHANGING):
-            try:
+            with reader.counting(event.topic):
                 _change(session, event)
-            except MagnetosutureError as error:
-                reader.refused[f"{event.topic}: {error}"] += 1
         if not isinstance(event, Observation) or not event.found:
             continue
         results: Iterator[PredictionResult] = iter(())

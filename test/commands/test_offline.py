@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
-from magnetosuture_thread import cli, replay_offline
+from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import packed_compressed_image
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
@@ -224,26 +224,6 @@ def test_a_recorded_point_at_the_tip_gives_a_needle_without_a_thread_its_directi
     found = list(observed(tmp_path / "bag"))
     assert [bool(len(each.tail)) for each in found] == [False] * 7 + [True] * 5
     assert found[-1].tail == pytest.approx(ends[0], abs=2e-4)
-
-
-def test_a_silence_is_in_every_table(pose_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    source, file = Bag(pose_bag), tmp_path / "silent"
-    with BagWriter(file, source.notes) as bag:
-        for topic, type_name in source.topics.items():
-            bag.add_topic(topic, type_name)
-        for record in source.records():
-            later = 3600 * 10**9 * (record.time > source.start + 10**9 // 2)
-            message = record.decode()
-            message.header.stamp.sec += later // 10**9
-            bag.write_message(record.topic, record.time + later, message)
-    words = "3600.0 s at the longest"
-    assert cli.main(["replay", str(file), "--offline", "--output", str(tmp_path / "out")]) == 0
-    assert words in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    found = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert found["silence"]["max_gap"] == pytest.approx(3600.0, abs=0.1)
-    assert found["speed"] < 1e4
-    assert cli.main(["evaluate", str(file), "--output", str(tmp_path / "page")]) == 0
-    assert words in capsys.readouterr().out
 
 
 def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, LoopCollector, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import Percentiles, compare_errors, stage_latencies
+from magnetosuture_thread.evaluation.metrics import Percentiles, SensorSilence, compare_errors, stage_latencies
 from magnetosuture_thread.evaluation.tables import loop_table, summary_table
 from magnetosuture_thread.settings.errors import GraphError
 from test.evaluation.runs import replay_summary
@@ -158,8 +158,17 @@ def test_the_table_says_what_is_simulated_and_fits_a_terminal():
     assert "truth" not in text
     assert "without an answer" not in text
     given: dict[str, Any] = {"refused": {"a pose that is none": 2}, "damage": "the end is missing"}
+    given["silence"] = SensorSilence(1, 3600.0, 3600.0, 0.5)
     text = shown(replace(summary, source="poses", speed=52.4, latency={}, remark="it is another thread", **given))
-    for words in ("recorded poses", "usable", "a pose that is none", "52.4", "the end is missing", "another thread"):
+    for words in (
+        "recorded poses",
+        "usable",
+        "a pose that is none",
+        "52.4",
+        "the end is missing",
+        "another thread",
+        "3600.0 s at",
+    ):
         assert words in text
     for words in ("camera frames", "velocity", "latency", "dropped"):
         assert words not in text
