@@ -28,15 +28,7 @@ setup(
     entry_points={"console_scripts": [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]},
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={
-        PACKAGE: [
-            "py.typed",
-            "commands/campaign.html",
-            "commands/campaign.css",
-            "evaluation/page.html",
-            "evaluation/page.css",
-            "evaluation/page.js",
-            "console/page/*",
-        ]
+        PACKAGE: ["py.typed", "console/page/*"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

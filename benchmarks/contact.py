@@ -25,7 +25,7 @@ from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.commands.command import make_log
-from magnetosuture_thread.commands.reproduce_hernia import (
+from magnetosuture_thread.evaluation.hernia import (
     paper_model,
     point_filter,
     read_steering,

@@ -17,7 +17,6 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-from playwright.sync_api import sync_playwright
 from procedure_animation import draw_procedure
 
 ROOT = Path(__file__).parents[1]
@@ -38,22 +37,9 @@ def magnetosuture(*words: str | Path) -> None:
 
 
 def demo(folder: Path) -> Path:
-    """Return the summary of a live replay."""
-    magnetosuture("replay", BAG, "--output", folder / "replay")
+    """Return the picture of a replay without a graph."""
+    magnetosuture("replay", BAG, "--offline", "--output", folder / "replay")
     return (folder / "replay" / "summary.png").rename(folder / "demo.png")
-
-
-def report(folder: Path) -> Path:
-    """Return the top of a page of `evaluate`, as a browser shows it."""
-    magnetosuture("evaluate", BAG, "--output", folder / "evaluated")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 960, "height": 1560})
-        page.goto((folder / "evaluated" / f"{BAG.name}.html").as_uri())
-        page.wait_for_load_state("networkidle")
-        page.screenshot(path=folder / "report.jpg", type="jpeg", quality=85)
-        browser.close()
-    return folder / "report.jpg"
 
 
 def frames(folder: Path) -> Path:
@@ -122,7 +108,6 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     maker.__name__: maker
     for maker in (
         demo,
-        report,
         frames,
         calibration,
         own_barrier,

@@ -14,7 +14,7 @@ import numpy as np
 
 from magnetosuture_thread.bags.packing import packed_twist
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.reproduce_hernia import RATE, SteeredThread, point_filter, start_centreline
+from magnetosuture_thread.evaluation.hernia import RATE, SteeredThread, point_filter, start_centreline
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.interface import OPERATOR_COMMAND
 

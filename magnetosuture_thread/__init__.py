@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magnetosuture_thread.calibration.bags import calibrate_bags
     from magnetosuture_thread.coils.filter import FilteredCommand, NeedleSafetyFilter
-    from magnetosuture_thread.commands.replay import replay_offline
     from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
+    from magnetosuture_thread.evaluation.replay import replay_offline
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
     from magnetosuture_thread.geometry.barrier import Barrier, Gradient, check_gradient
     from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
@@ -37,7 +37,7 @@ _HOME = {
     "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
     "calibration.bags": ("calibrate_bags",),
-    "commands.replay": ("replay_offline",),
+    "evaluation.replay": ("replay_offline",),
     "estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "thread.margins": ("BarrierMargins", "Margins"),
     "thread.prediction": ("NeedlePose", "Prediction"),

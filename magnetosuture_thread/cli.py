@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -63,6 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
 
     def run() -> int:
+        # A command draws into files. What a notebook asks of its own kernel may not be importable here.
+        os.environ["MPLBACKEND"] = "agg"
         options = make_parser(given[:1]).parse_args(given)
         check_outputs(options)
         return int(options.run(options, Terminal()))

@@ -41,11 +41,9 @@ OWNED = (
     ("numba", {"geometry"}),
     ("playwright", set[str]()),
     ("osqp", {"thread"}),
-    ("dask distributed", {"evaluation"}),
-    ("pyarrow", {"commands"}),
+    ("dask distributed pyarrow", {"evaluation"}),
     ("upath", {"settings"}),
     ("shapely", {"geometry", "planning", "rig"}),
-    ("jinja2 plotly", {"evaluation"}),
     ("simplejpeg", {"vision"}),
     ("matplotlib", {"evaluation", "calibration", "commands"}),
     ("rich", {"commands", "evaluation", "calibration"}),
@@ -128,13 +126,13 @@ def test_what_is_installed_needs_nothing_of_the_source_tree():
     assert_none({path: {name.split(".")[0] for name in imported(path)} & outside for path in MODULES}, "may not import")
 
 
-LATE = {"matplotlib", "plotly", "scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.stats"}
+LATE = {"matplotlib", "scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.stats"}
 
 
 @pytest.mark.parametrize(("modules", "allowed"), [(sorted(MAKERS), set[str]()), (["console"], {"aiohttp"})])
 def test_a_node_needs_no_library_for_plots_bags_or_pages(modules: list[str], allowed: set[str]):
     """Only the node that serves the page has that of its server."""
-    unneeded = {"matplotlib", "plotly", "jinja2", "rich", "rosbags", "mcap", "lz4", "zstandard", "pyarrow", "aiohttp"}
+    unneeded = {"matplotlib", "rich", "rosbags", "mcap", "lz4", "zstandard", "pyarrow", "aiohttp"}
     code = (
         "import sys, " + ", ".join(f"magnetosuture_thread.nodes.{name}" for name in modules) + "; print(*sys.modules)"
     )

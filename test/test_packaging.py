@@ -174,5 +174,5 @@ def test_colcon_installs_programs_version_launch_file_and_settings(tmp_path: Pat
     shell = f". {tmp_path}/install/setup.sh && exec {programs}/magnetosuture --version"
     done = subprocess.run(["sh", "-c", shell], cwd="/", env=environment, check=True, timeout=300, capture_output=True)
     assert done.stdout.decode().split()[-1] == magnetosuture_thread.__version__
-    start = [sys.executable, ROOT / ".ci" / "installed_nodes.py", tmp_path / "install", "scene_server"]
+    start = [sys.executable, str(ROOT / ".ci" / "installed_nodes.py"), str(tmp_path / "install"), "scene_server"]
     subprocess.run(start, env=environment, check=True, timeout=600)

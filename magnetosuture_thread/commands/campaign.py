@@ -1,45 +1,35 @@
-"""The command `magnetosuture campaign`: many runs of a procedure in the closed loop, and what came of them.
-
-The page loads nothing and runs no script. Its pictures are SVG: lengths in mm, y upwards.
-"""
+"""The command `magnetosuture campaign`: many runs of a procedure in the closed loop, and what came of them."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import math
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from statistics import median
 from time import process_time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.evaluation.page import page_style, read_source, read_template
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
+from magnetosuture_thread.evaluation.replay import picture_or_log
+from magnetosuture_thread.evaluation.tables import write_table
 from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
-from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.rig import campaign as run
 from magnetosuture_thread.rig.closed_loop import RunBag
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup
-from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.errors import BagError, shortened
 from magnetosuture_thread.settings.files import whole_folder
 
-REASONS = {
-    "min_needle_clearance_m": "the needle came too close to wall or shape",
-    "max_thread_penetration_m": "a node of the thread was in wall or shape",
-    "longest_rest_s": "the needle rested too long",
-    "max_tension_n": "the thread's tension was too high",
-    "max_friction_nodes": "too many nodes were under friction",
-    "time_s": "it took too long",
-}
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MAX_PANELS = 12  # failed runs that are drawn; the figures of all are in the table
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +55,8 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
     on simulated time, without ROS; a seed always gives the same run. Each seed varies start, viscosity, bending
     stiffness, coils, friction and noise; the nodes are told nothing of it. DIR, which must not exist, gets
       campaign.json   how many runs succeeded, and the figures of each
-      campaign.html   the same as a page, with pictures of the last seconds of each run that failed
+      campaign.csv    the figures of each run
+      campaign.png    the figures of all runs, and the last seconds of those that failed
       bags/seed_N     for each seed of --bags: what all nodes would publish, with the ground truth; `replay` takes it
     With --scheduler and --bags, DIR must be a folder that all workers have.
     A run succeeds if all goals are reached and all limits hold. All of it is simulated.
@@ -95,8 +86,11 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
             speed = found[seed].simulated_s / used_time
             terminal.log(f"seed {seed}: {found[seed].reason or 'success'} ({speed:.1f} times real time)")
         result.runs.extend(found[seed] for seed in seeds if seed in found)
-        (folder / "campaign.json").write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
-        (folder / "campaign.html").write_text(write_page(result), encoding="utf-8")
+        rows = [each.to_json() for each in result.runs]
+        for ending in ("json", "csv"):
+            write_table(folder / f"campaign.{ending}", rows, result.to_json())
+        if picture := picture_or_log(partial(draw_campaign, result), terminal.log):
+            (folder / "campaign.png").write_bytes(picture)
     title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
     columns = ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]")
     cells = []
@@ -106,7 +100,7 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
         others = (f"{figures.longest_rest_s:.2f}", f"{figures.wrap_degrees:.0f}")
         cells.append((str(each.seed), "yes" if each.success else "no", str(each.goals_met), *times, *others))
     terminal.print(command.make_table(f"{title} (simulated)", columns, cells, left=0))
-    terminal.print(f"report: {options.output / 'campaign.html'}", soft_wrap=True)
+    terminal.log(f"results: {options.output}")
     return command.FAILED if result.died else command.DONE
 
 
@@ -175,95 +169,66 @@ def _run(
     return found, process_time() - began
 
 
-def write_page(result: CampaignResult) -> str:
-    """Return the report as a page of HTML, with pictures of failed runs."""
-    rows: list[dict[str, Any]] = [
-        {
-            "result": each,
-            "broken": set(each.figures.beyond_limits(result.setup.coils.keep_out)),
-            "pictures": [],
-            "closest": None,
-        }
-        for each in result.runs
-    ]
-    failed = [row for row in rows if not row["result"].success]
-    for row in failed[:200]:  # of the others the figures are in the table
-        _add_pictures(row, result)
-    reasons: dict[str, list[int]] = {}
-    for row in failed:
-        not_reached = [] if row["result"].reached else ["not all goals reached"]
-        for why in (*not_reached, *(REASONS[name] for name in sorted(row["broken"]))):
-            reasons.setdefault(why, []).append(row["result"].seed)
-    scene, reached = result.setup.scene, [each.figures for each in result.runs if each.reached]
-    return read_template(__package__, "campaign.html", {"spaced": lambda text: text.replace("_", " ")}).render(
-        details=result,
-        runs=rows,
-        failed=[row for row in failed if row["pictures"]],
-        left_out=len(failed[200:]),
-        reached=len(reached),
-        ratios=[each.time_s / each.ideal_time_s for each in reached if each.ideal_time_s > 0.0],
-        median=median,
-        reasons=sorted(reasons.items(), key=lambda each: -len(each[1])),
-        shapes=[{"kind": shape.kind, "path": _outline(shape.geometry)} for shape in scene.shapes],
-        dish_radius=1e3 * scene.dish.radius,
-        needle_width=1e3 * result.setup.rig.needle_width,
-        halo_width=2e3 * result.min_clearance,
-        limits=run,
-        style=page_style() + read_source(__package__, "campaign.css"),
+def draw_campaign(result: CampaignResult) -> bytes:
+    """Return the picture of a campaign (PNG): figures by seed with their limits, and the last seconds of failed runs.
+
+    Of each failed run the dish is drawn at its end, with the needle of the last seconds ever fainter, and in red where
+    the needle's axis was closest to wall or shape. All of it is the simulation's ground truth.
+    """
+    from magnetosuture_thread.evaluation import plots  # late, as it imports matplotlib
+
+    failed = [each for each in result.runs if not each.success][:MAX_PANELS]
+    rows = -(-len(failed) // 4)
+    height = 3.3 + 3.6 * rows
+    figure = plots.make_figure(14.0, height)
+    count = len(result.runs) + len(result.died)
+    title = f"{result.procedure.name} on {result.setup.name}, simulated: {result.successes} of {count} runs succeeded"
+    words = "green: succeeded, red: failed; dashed: limit"
+    if failed:
+        words += "; below: failed runs at their end, magenta: thread, black: needle of the last seconds,"
+        words += (
+            "\nred: where it was closest to wall or shape, orange: planned way of its middle, arrow: commanded velocity"
+        )
+    for text, below, size in ((title, 0.15, 14), (words, 0.5, 9.5)):
+        figure.text(0.015, 1.0 - below / height, text, fontsize=size, color=plots.INK, va="top", parse_math=False)
+    colours = [plots.GOOD if each.success else plots.BAD for each in result.runs]
+    seeds = [each.seed for each in result.runs]
+    panels = (
+        ("clearance of the needle's axis [mm]", "min_needle_clearance_m", 1e3, result.min_clearance),
+        ("longest rest [s]", "longest_rest_s", 1.0, run.MAX_REST),
+        ("depth of a node in wall or shape [µm]", "max_thread_penetration_m", 1e6, run.PENETRATION_TOLERANCE),
+        ("peak tension [mN]", "max_tension_n", 1e3, np.nan),
     )
+    for column, (title, name, scale, limit) in enumerate(panels):
+        axes = figure.add_axes((0.035 + 0.25 * column, 1.0 - 2.8 / height, 0.2, 1.7 / height))
+        axes.scatter(seeds, [scale * getattr(each.figures, name) for each in result.runs], c=colours, s=22)
+        axes.axhline(scale * limit, color=plots.FAINT, linewidth=0.9, linestyle=(0, (4, 3)))
+        axes.set_title(title, fontsize=9.5, color=plots.INK, loc="left")
+        axes.set_xlabel("seed", fontsize=8.5, color=plots.INK, labelpad=1)
+        plots.tidy(axes)
+    for index, each in enumerate(failed):
+        row, column = divmod(index, 4)
+        axes = figure.add_axes((0.01 + 0.2475 * column, (3.6 * (rows - 1 - row) + 0.05) / height, 0.24, 3.1 / height))
+        axes.set_title(f"seed {each.seed}: {shortened(each.reason, 38)}", fontsize=9, color=plots.INK, loc="left")
+        _draw_failed_run(axes, each, result)
+    return plots.to_png(figure)
 
 
-def _add_pictures(row: dict[str, Any], result: CampaignResult) -> None:
-    """Add the pictures of a failed run: the whole dish at its end, its last seconds, and its closest instant.
+def _draw_failed_run(axes: Axes, failed: run.RunResult, result: CampaignResult) -> None:
+    """Draw the dish with a failed run's end, its last seconds, and where its needle was closest to wall or shape."""
+    from magnetosuture_thread.evaluation import plots
 
-    The closest is there if the needle came too close, before the last seconds.
-    """
-    instants, closest = row["result"].last_instants, row["result"].closest_instant
-    if not instants:
-        return
-    scene, speed = result.setup.scene, result.procedure.limits[0].speed
-    row["pictures"] = [_picture(instants[-1], scene, speed, overview=True)]
-    row["pictures"] += [_picture(instant, scene, speed) for instant in instants]
-    if closest and closest.frame.time < instants[0].frame.time and "min_needle_clearance_m" in row["broken"]:
-        row["closest"] = _picture(closest, scene, speed)
-
-
-def _picture(instant: run.RunInstant, scene: Scene, speed: float, *, overview: bool = False) -> dict[str, Any]:
-    """Return an instant as an SVG shows it, the whole dish or the surroundings of the needle.
-
-    Args:
-        instant: to show.
-        scene: around it.
-        speed: at which the arrow of the command has the needle's length [m/s].
-        overview: whether the whole dish is shown.
-    """
-    axis, frame = instant.axis, instant.frame
-    length = float(np.linalg.norm(axis[-1] - axis[0]))
-    # A close-up is four needles wide, and 8 mm at least.
-    half, centre = 0.5 * max(4.0 * length, 8e-3), 0.5 * (axis[0] + axis[-1])
-    if overview:
-        half, centre = 1.02 * scene.dish.radius, np.zeros(2)
-    command: list[float] = []
-    if math.hypot(*frame.commanded) > 1e-6:
-        command = np.round(1e3 * np.append(axis[-1], axis[-1] + length / speed * frame.commanded), 3).tolist()
-    return {
-        "instant": instant,
-        "box": np.round(1e3 * np.append(centre - half, (2.0 * half, 2.0 * half)), 3).tolist(),
-        "thread": _points(frame.thread),
-        "needle": _points(axis),
-        "path": "" if instant.path is None else _points(instant.path),
-        "command": command,
-        "is_overview": overview,
-    }
-
-
-def _points(vertices: Points) -> str:
-    return " ".join(f"{1e3 * x:.3f},{1e3 * y:.3f}" for x, y in vertices.tolist())
-
-
-def _outline(geometry: Disc | Polygon) -> str:
-    """Return a shape's outline and holes as the path of an SVG."""
-    if isinstance(geometry, Disc):
-        x, y, r = (1e3 * value for value in (*geometry.centre, geometry.radius))
-        return f"M{x - r:.3f},{y:.3f}a{r:.3f},{r:.3f} 0 1 0 {2 * r:.3f},0a{r:.3f},{r:.3f} 0 1 0 {-2 * r:.3f},0z"
-    return "".join(f"M{_points(ring).replace(' ', 'L')}z" for ring in geometry.rings)
+    plots.draw_shapes(axes, result.setup.scene)
+    for age, instant in enumerate(reversed(failed.last_instants)):
+        axes.plot(*(1e3 * instant.axis.T), color=plots.INK, linewidth=2.4, alpha=0.8 * 0.55**age)
+    if failed.closest_instant is not None:
+        axes.plot(*(1e3 * failed.closest_instant.axis.T), color=plots.BAD, linewidth=1.2)
+    if failed.last_instants:
+        end = failed.last_instants[-1]
+        axes.plot(*(1e3 * end.frame.thread.T), color=plots.PREDICTED, linewidth=1.4)
+        if end.path is not None:
+            axes.plot(*(1e3 * end.path.T), color="#f28c28", linewidth=1.0, linestyle=(0, (4, 2)))
+        length = float(np.linalg.norm(end.axis[-1] - end.axis[0]))  # of the arrow at the allowed speed
+        plots.draw_arrow(
+            axes, 1e3 * end.axis[-1], 1e3 * length / result.procedure.limits[0].speed * end.frame.commanded
+        )

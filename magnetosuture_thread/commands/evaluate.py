@@ -1,54 +1,39 @@
-"""The command `magnetosuture evaluate`: a page for each bag and a table over all, or scores of trajectories."""
+"""The command `magnetosuture evaluate`: bags, or reference trajectories, as a table and a picture of each."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
-import platform
-from array import array
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.bags.reader import RecordedMessage
-from magnetosuture_thread.bags.reading import stamp_of
-from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.bags.storage import METADATA_FILE, find_bag_files
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.commands.replay import find_photos
 from magnetosuture_thread.commands.track import numbered
-from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.estimator.thread_session import WAITING
-from magnetosuture_thread.evaluation import recorded, reference, tables
-from magnetosuture_thread.evaluation.figures import STAGES, BagDetails, Figures, LiveFigures
-from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
-from magnetosuture_thread.evaluation.page import write_page
-from magnetosuture_thread.evaluation.plots import draw_case, draw_worst_frame
+from magnetosuture_thread.evaluation import reference, tables
+from magnetosuture_thread.evaluation.recorded import NOT_FOUND, BagInput, BagSelection, open_bag
+from magnetosuture_thread.evaluation.replay import draw_run, measure_run, picture_or_log, recorded_latency
 from magnetosuture_thread.evaluation.tables import Row
 from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings import interface
-from magnetosuture_thread.settings.configuration import Configuration, configuration_fields
 from magnetosuture_thread.settings.errors import BagError, one_line
-from magnetosuture_thread.settings.files import is_url, whole_folder
+from magnetosuture_thread.settings.files import is_url, whole_file, whole_folder
 from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
-REFERENCE_OPTIONS = ("solver", "segments", "rig", "json", "pictures")
+BAG_OPTIONS = ("setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
+REFERENCE_OPTIONS = ("solver", "segments", "rig")
+MARKS = {"simulated": "* simulated", "unverified": "? unverified", "silences": "! frames are missing"}  # by column
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -59,9 +44,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("paths", type=command.bag_location, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
     formulation = "how a step is written (default: a bag's setup's; rod)"
     option("--formulation", choices=("rod", "paper"), default="", help=formulation)
+    option("--output", type=Path, metavar="DIR", help="folder to make: table.json, and a picture NAME.png of each PATH")
+    table = "the table as a file: JSON, CSV or Parquet by the name's ending"
+    option("--table", "--json", dest="json", type=command.output_file, metavar="FILE", help=table)
     bags = parser.add_argument_group("bags")
-    bags.add_argument("--output", type=Path, metavar="DIR", help="folder to make; required")
-    against = "measured thread (seen) or ground truth (default: both where present, the worst frames by ground truth)"
+    against = "measured thread (seen) or ground truth (default: both where present, the picture by ground truth)"
     bags.add_argument("--against", choices=("auto", "truth", "seen"), default="auto", help=against)
     command.add_source(bags, "each bag")
     command.add_span(bags, "each bag")
@@ -72,8 +59,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--segments", type=count, metavar="N", help="number of segments (default: the paper's, as each file says)")
     rig = "score the simulated rig's thread instead of the model (default: N = 100)"
     option("--rig", action="store_true", help=rig)
-    option("--json", type=command.output_file, metavar="FILE", help="write the figures to a file")
-    option("--pictures", type=Path, metavar="FOLDER", help="draw each case into a folder")
 
 
 def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int:
@@ -81,13 +66,9 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
 
     Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
     the measured centreline and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a
-    bag, or a folder of bags, which may be up to two folders below; or the URL of one, such as s3://BUCKET/RUNS. DIR,
-    which must not exist, gets
-      NAME.html    a page for each bag, which needs no network: plots to zoom, the worst frames
-      table.csv    a row for each bag, SI units and %
-      table.json   the same, with mean and worst, and prediction and estimate side by side
-      table.parquet  table.csv for DuckDB or pandas, where pyarrow is installed (extra `cluster`)
-    A bag that cannot be evaluated has its row too, with the problem in it; the exit code is 1 then.
+    bag, or a folder of bags, which may be up to two folders below; or the URL of one, such as s3://BUCKET/RUNS. The
+    table has a row for each bag, SI units and %. A bag that cannot be evaluated has its row too, with the problem in
+    it; the exit code is 1 then. `replay --offline` writes poses, predictions and estimates as a bag.
 
     Reference trajectories: files DIR/*.npz with the needle's poses and the thread that followed (arrays t, pose, X and
     meta, as for `render`). The model starts from the first thread, is driven by the poses and nothing else, with each
@@ -97,31 +78,36 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
     """
     is_bags = kind_of(options.paths) == "bags"
     for name in REFERENCE_OPTIONS if is_bags else BAG_OPTIONS:
-        given = getattr(options, name)
-        if given != options.default_of(name):
+        value = getattr(options, name)
+        if value != options.default_of(name):
             why = "for reference trajectories; PATH is none" if is_bags else "for bags; PATH is a reference trajectory"
-            raise ConfigurationError(f"--{name}", str(given), f"nothing: it is only {why}")
-    if not is_bags:
+            raise ConfigurationError(f"--{name}", str(value), f"nothing: it is only {why}")
+    if options.json is not None:
+        tables.check_table(options.json)
+    if is_bags:
+        names = ("paths", "output", "against", "formulation", "workers", "scheduler")
+        selection = {**command.given(options, *names), **command.bag_selection(options)}
         with terminal.progress("evaluate") as advance:
-            evaluation = _score_references(options, advance)
-        terminal.print(tables.evaluation_table(evaluation))
-        command.write_json(options.json, evaluation.to_mapping())
-        return command.DONE
-    if missing := [path for path in options.paths if not is_url(path) and not path.exists()]:
-        raise BagError(missing[0], "does not exist; expected bags, folders of them, or reference trajectories")
-    if options.output is None:
-        raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
-    given = command.given(options, "paths", "output", "against", "formulation", "workers", "scheduler")
-    with terminal.progress("evaluate") as advance:
-        rows = evaluate_bags(**given, **command.bag_selection(options), log=terminal.log, progress=advance)
-    terminal.print(tables.bags_table(rows))
-    terminal.log(f"results: {options.output}")
-    return command.FAILED if any(row["problem"] for row in rows) else command.DONE
+            rows = evaluate_bags(**selection, log=terminal.log, progress=advance)
+        document = tables.bags_document(rows)
+        terminal.print(bags_table(rows))
+    else:
+        with terminal.progress("evaluate") as advance:
+            evaluation = evaluate_references(options, terminal.log, advance)
+        document = evaluation.to_mapping()
+        rows = document["cases"]
+        terminal.print(references_table(evaluation))
+    if options.json is not None:
+        with whole_file(options.json) as file:
+            tables.write_table(file, rows, document)
+    for path in filter(None, (options.output, options.json)):
+        terminal.log(f"results: {path}")
+    return command.FAILED if any(row.get("problem") for row in rows) else command.DONE
 
 
 def evaluate_bags(
     paths: Sequence[Path],
-    output: Path,
+    output: Path | None = None,
     *,
     against: str = "auto",
     formulation: str = "",
@@ -129,17 +115,16 @@ def evaluate_bags(
     scheduler: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[recorded.BagSelection],
+    **selection: Unpack[BagSelection],
 ) -> list[Row]:
     """Evaluate bags, each for itself.
 
-    `output` is made at the end, whole or not at all: NAME.html of each bag, table.csv and table.json. A bag that
-    cannot be evaluated has its row all the same, with the problem in it, and no page. What is written does not depend
-    on the number of workers, but for the times that steps took.
+    A bag that cannot be evaluated has its row all the same, with the problem in it, and no picture. What is written
+    does not depend on the number of workers, but for the times that steps took.
 
     Args:
         paths: bags, or folders of bags.
-        output: folder to make.
+        output: folder to make, whole or not at all: NAME.png of each bag, and table.json; none if None.
         against: `truth` or `seen` (measured); `auto`: both where present.
         formulation: of the model; the setup's if empty.
         workers: processes.
@@ -159,66 +144,117 @@ def evaluate_bags(
         read_setup(setup_name)  # refuses what is wrong for all before anything is done
     bags = find_bags(paths)
     names = numbered([name_of(bag) for bag in bags], "{}-{}")
-    tasks = [EvaluationTask(bag, name, against, formulation, selection) for bag, name in zip(bags, names, strict=True)]
+    tasks = [
+        EvaluationTask(bag, name, against, formulation, selection, output is not None)
+        for bag, name in zip(bags, names, strict=True)
+    ]
     rows: dict[int, Row] = {}
-    with whole_folder(output) as folder, TaskRunner(evaluate_one, workers, scheduler) as runner:
+    with ExitStack() as stack:
+        folder = stack.enter_context(whole_folder(output)) if output is not None else None
+        runner = stack.enter_context(TaskRunner(evaluate_one, workers, scheduler))
         for index, result in runner.run(tasks, log, progress):
             task = tasks[index]
-            row, page = (_failed(task, str(result)), "") if isinstance(result, WorkerDiedError) else result
+            row, picture = (_failed(task, str(result)), b"") if isinstance(result, WorkerDiedError) else result
             if row["problem"]:
                 log(f"{task.name}: {row['problem']}")
-            else:
-                (folder / f"{task.name}.html").write_text(page, encoding="utf-8")
+            if folder is not None and picture:
+                (folder / f"{task.name}.png").write_bytes(picture)
             rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
-        (folder / "table.csv").write_text(tables.table_csv(ordered), encoding="utf-8", newline="")
-        (folder / "table.json").write_text(tables.table_json(ordered), encoding="utf-8")
-        if problem := write_parquet(folder / "table.parquet", [tables.flat(row) for row in ordered]):
-            log(f"no table.parquet: {problem}")
+        if folder is not None:
+            tables.write_table(folder / "table.json", ordered, tables.bags_document(ordered))
     return ordered
 
 
-def evaluate_one(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, str]:
-    """Return the row of a bag and its page; with a problem in the row, there is no page: nothing stops the others."""
+@dataclass(frozen=True)
+class EvaluationTask:
+    """A bag to evaluate.
+
+    Attributes:
+        path: of the bag.
+        name: of its row and picture.
+        against: what predictions are compared with: `truth`, `seen` (measured), or `auto`: both where present.
+        formulation: of the model; the setup's if empty.
+        selection: what of the bag is read.
+        is_drawn: whether a picture is drawn.
+    """
+
+    path: Path
+    name: str
+    against: str
+    formulation: str
+    selection: BagSelection
+    is_drawn: bool
+
+
+def evaluate_one(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, bytes]:
+    """Return the row of a bag and its picture; with a problem in the row, there is none: nothing stops the others."""
     try:
-        return evaluate_bag(task, lambda text: log(f"{task.name}: {text}"), progress)
+        return _evaluate_bag(task, lambda text: log(f"{task.name}: {text}"), progress)
     except MagnetosutureError as error:
-        return _failed(task, str(error)), ""
+        return _failed(task, str(error)), b""
     except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
-        return _failed(task, f"{type(error).__name__}: {error}"), ""
+        return _failed(task, f"{type(error).__name__}: {error}"), b""
 
 
 def _failed(task: EvaluationTask, problem: str) -> Row:
     return tables.failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
 
 
-def write_parquet(path: Path, rows: Sequence[dict[str, Any]]) -> str:
-    """Write rows as a Parquet table for DuckDB or pandas; return why none is written, if pyarrow is broken.
+def _evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, bytes]:
+    """Evaluate a bag; return its row of the table, and its picture, empty if none is asked for.
 
-    Without pyarrow (extra `cluster`) none is written.
-
-    Args:
-        path: the file to make.
-        rows: plain values by column, the same columns in each.
+    Raises:
+        BagError: the bag cannot be used, what is compared with is not in it, or nothing in it was predicted.
+        ConfigurationError: the setup cannot be used.
     """
-    try:
-        from pyarrow import Table, parquet
-    except ModuleNotFoundError:
-        return ""
-    except ImportError as error:  # as with libraries of another NumPy
-        return f"pyarrow cannot be used: {' '.join(str(error).split())}"
-    parquet.write_table(Table.from_pylist(rows), path)
-    return ""
+    with open_bag(task.path, log, **task.selection) as bag:
+        recording, model = bag.recording, bag.setup.model
+        model = replace(model, formulation=task.formulation or model.formulation)
+        run = measure_run(bag, model, _targets(bag, task.against), progress)
+        if run.remark:
+            log(run.remark)
+        row = tables.row_of(
+            run.metrics,
+            run.silence,
+            recorded_latency(recording, bag.start, bag.duration),
+            bag=task.name,
+            path=one_line(str(recording.path)),
+            setup=bag.setup.name,
+            simulated=recording.notes.get("simulated", ""),
+            source=bag.source,
+            formulation=model.formulation,
+            duration_s=bag.duration,
+            damage="; ".join(str(region) for region in recording.damage.regions) if recording.damage else "",
+            unverified=recording.unverified,
+            refused=sum(count for why, count in run.refused.items() if why != NOT_FOUND),
+        )
+        return row, draw_run(bag, run.metrics, log) if task.is_drawn else b""
+
+
+def _targets(bag: BagInput, against: str) -> list[str]:
+    """Return what the predictions are compared with.
+
+    Raises:
+        BagError: the bag does not hold it.
+    """
+    counts, targets = bag.recording.counts, []
+    for target, channel in (("truth", interface.GROUND_TRUTH_THREAD), ("seen", interface.MEASURED_THREAD)):
+        if counts.get(channel.recorded) or (target == "seen" and bag.source == "camera"):
+            targets.append(target)
+        elif against == target:
+            raise BagError(bag.recording.path, f"has no messages on {channel.recorded} ({channel.type_name})")
+    return [target for target in targets if against in ("auto", target)]
 
 
 def name_of(bag: Path) -> str:
-    """Return the name of a bag's report: that of its folder or file."""
+    """Return the name of a bag's row and picture: that of its folder or file."""
     path = bag if is_url(bag) else Path(os.path.abspath(bag))
     name = one_line(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
     return name.encode()[:200].decode("utf-8", "ignore")
 
 
-def find_bags(paths: Sequence[Path], depth: int = 2) -> list[Path]:
+def find_bags(paths: Iterable[Path], depth: int = 2) -> list[Path]:
     """Return the bags at paths, in their order, each once; within a folder by name.
 
     Args:
@@ -228,21 +264,21 @@ def find_bags(paths: Sequence[Path], depth: int = 2) -> list[Path]:
     Raises:
         BagError: a path holds none.
     """
-    found: dict[Path, Path] = {}
+    bags: dict[Path, Path] = {}
     for path in paths:
-        bags = _bags(path, depth)
-        for bag in bags:
-            found.setdefault(bag.resolve(), bag)
-        if not bags:
+        inside = _bags(path, depth)
+        for bag in inside:
+            bags.setdefault(bag.resolve(), bag)
+        if not inside:
             endings = " or ".join(STORAGE_SUFFIXES)
             raise BagError(path, f"holds no bags ({endings}), nor do the folders in it")
-    return list(found.values())
+    return list(bags.values())
 
 
 def _bags(path: Path, depth: int) -> list[Path]:
     try:
         if not path.exists():
-            raise BagError(path, "does not exist; expected a bag, or a folder of bags")
+            raise BagError(path, "does not exist; expected a bag, a folder of bags, or reference trajectories")
         if path.is_file():
             return [path]
         inside = sorted(path.iterdir())
@@ -285,298 +321,89 @@ def _is_reference(path: Path) -> bool:
         return False
 
 
-def _score_references(options: argparse.Namespace, progress: Progress) -> reference.Evaluation:
+def evaluate_references(options: argparse.Namespace, log: Log, progress: Progress) -> reference.Evaluation:
+    """Score reference trajectories as the options say; write table.json and a picture of each into --output, if any."""
     paths = [path for folder in options.paths for path in reference.find_references(folder)]
-    formulation, pictures = options.formulation or "rod", options.pictures
-    if pictures:
-        pictures.mkdir(parents=True, exist_ok=True)
-
-    def keep(case: reference.CaseResult) -> None:
-        if pictures:
-            draw_case(pictures / f"{case.score.name}.png", case, "rig" if options.rig else formulation)
-
-    given: dict[str, Any] = {"segments": options.segments, "progress": progress, "keep": keep}
-    if options.rig:
-        return score_rig(paths, **given)
-    return reference.score(paths, formulation=formulation, solver=options.solver or "banded", **given)
-
-
-def score_rig(
-    paths: Sequence[Path],
-    segments: int | None = None,
-    progress: Progress = lambda share: None,
-    keep: Callable[[reference.CaseResult], None] = lambda result: None,
-) -> reference.Evaluation:
-    """Move the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
-
-    Of the scores, `max_residual` is in units of the drag across the whole thread at the case's greatest speed, and
-    `fallbacks` counts steps that had to be halved.
-
-    Args:
-        paths: the trajectories.
-        segments: n, 100 unless given.
-        progress: is told the share done.
-        keep: is given each case's result.
-
-    Raises:
-        BagError: a file is no reference trajectory.
-        SolverError: a step could not be solved.
-    """
-    count = segments or 100
-    # Of a needle whose motion is given, the body does not matter.
-    body = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
-
-    def score_case(trajectory: reference.ReferenceTrajectory, path: Path, share: Progress) -> reference.CaseResult:
-        thread = _rig_thread(trajectory, path, count)
-        first, length = trajectory.threads[0], thread.length
-        if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - trajectory.tails[0]) > 0.1 * length / count:
-            raise BagError(path, "has a first thread of one point, or one that does not begin at the needle's tail")
-        if thread.diameter >= length:
-            raise BagError(path, f"has a thread of {thread.diameter:g} m in diameter, expected less than its length")
-        surface, heading = Surface(discs=trajectory.discs), float(trajectory.headings[0])
-        rig = RigDynamics(body, thread, surface, None, trajectory.tails[0], heading, first)
-        speed = np.linalg.norm(np.diff(trajectory.tails, axis=0), axis=1) / np.diff(trajectory.times)
-        force = thread.drag_across * length * max(float(speed.max()), 1e-6)
-
-        def step(index: int) -> RigDynamics:
-            interval = trajectory.times[index] - trajectory.times[index - 1]
-            rig.drive(trajectory.tails[index], float(trajectory.headings[index]), interval)
-            return rig
-
-        def figures(rig: RigDynamics) -> reference.StepFigures:
-            strain = max(0.0, float(rig.tension.max()) / thread.stretching_stiffness)
-            return reference.StepFigures(rig.thread, strain, rig.residual / force, rig.halvings)
-
-        return reference.run_case(trajectory, rig.thread, length, thread.diameter, step, figures, share)
-
-    return reference.Evaluation("rig", "newton", reference.score_each(paths, score_case, progress, keep))
+    cases: list[reference.CaseResult] = []
+    settings: dict[str, Any] = {"segments": options.segments, "progress": progress}
+    settings["keep"] = cases.append if options.output is not None else lambda case: None
+    with ExitStack() as stack:
+        folder = stack.enter_context(whole_folder(options.output)) if options.output is not None else None
+        if options.rig:
+            evaluation = reference.score_rig(paths, **settings)
+        else:
+            names: dict[str, Any] = {"formulation": options.formulation or "rod", "solver": options.solver or "banded"}
+            evaluation = reference.score(paths, **names, **settings)
+        if folder is not None:
+            document = evaluation.to_mapping()
+            tables.write_table(folder / "table.json", document["cases"], document)
+            for case in cases:
+                if picture := picture_or_log(partial(_draw_case, case, evaluation.formulation), log):
+                    name = one_line(case.score.name).replace("/", "_")
+                    (folder / f"{name}.png").write_bytes(picture)
+    return evaluation
 
 
-def _rig_thread(trajectory: reference.ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
-    """Return the thread that a trajectory's metadata describes.
+def _draw_case(case: reference.CaseResult, formulation: str) -> bytes:
+    from magnetosuture_thread.evaluation.plots import draw_metrics  # late, as it imports matplotlib
 
-    Raises:
-        BagError: the metadata lacks something, or holds what is none.
-    """
-    names = ("L_m", "EI_Nm2", "EA_N", "zeta_perp_Pa_s", "zeta_par_Pa_s", "diameter_m")
-    try:
-        given = trajectory.metadata["material"]
-        length, bending, stretching, across, along, diameter = values = [float(given[name]) for name in names]
-        attachment = {"pinned": NeedleJoint.PINNED, "clamped": NeedleJoint.CLAMPED}[trajectory.metadata["boundary"]]
-    except reference.NOT_ONE as error:
-        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
-    if not all(math.isfinite(value) and value > 0.0 for value in values):
-        raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
-    return ThreadProperties(length, segments, bending, stretching, across, along, attachment, diameter=diameter)
+    diameter = 2.1 * float(np.abs(case.reference.threads).max())
+    return draw_metrics(case.metrics, f"{case.score.name}, formulation {formulation}", diameter)
 
 
-LATENT = dict(zip((interface.NEEDLE_POSE, interface.PREDICTED_THREAD, interface.CURRENTS), STAGES, strict=True))
-
-
-@dataclass(frozen=True)
-class EvaluationTask:
-    """A bag to evaluate.
-
-    Attributes:
-        path: of the bag.
-        name: of its report.
-        against: what predictions are compared with: `truth`, `seen` (measured), or `auto`: both where present.
-        formulation: of the model; the setup's if empty.
-        selection: what of the bag is read.
-    """
-
-    path: Path
-    name: str
-    against: str
-    formulation: str
-    selection: recorded.BagSelection
-
-
-def evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, str]:
-    """Evaluate a bag; return its row of the table, and its page.
-
-    Of each frame some numbers are kept, and of a few frames the threads: memory grows by 210 bytes a frame.
-
-    Args:
-        task: which bag, and how.
-        log: called with a line for a person.
-        progress: called with the share done, 0 to 1.
-
-    Raises:
-        BagError: the bag cannot be used, what is compared with is not in it, or nothing in it was predicted.
-        ConfigurationError: the setup cannot be used.
-    """
-    with recorded.open_bag(task.path, log, **task.selection) as given:
-        recording, span = given.recording, (given.start, given.duration)
-        model = replace(given.setup.model, formulation=task.formulation or given.setup.model.formulation)
-        is_recorded = bool(recording.counts.get(interface.PREDICTED_THREAD.recorded))
-        targets = _targets(given, task.against)
-        metrics = RunMetrics(model.thread_length, recording.start, targets, recorded=is_recorded)
-        seen = given.observations(lambda share: progress(0.95 * share))
-        held, refused = RecordedPredictions(recording, *span), Counter[str]()
-        for step in recorded.predictions(seen, model, given.setup.scene, metrics.observe):
-            own = held.of(step.observation.stamp) if step.result.prediction is not None else None
-            recorded.measure_step(step, metrics, refused, own)
-        figures = Figures.of(metrics, live_figures(recording, *span), (given.start, given.start + given.duration))
-        refused += (
-            Counter({why: count for why, count in seen.refused.items() if why != recorded.NOT_FOUND})
-            + recording.refused
-        )
-        if not figures.predicted:
-            counts = Counter(metrics.reasons) + refused
-            why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING
-            found = f"{figures.tracked} of {figures.frames} had a needle"
-            raise BagError(recording.path, f"gave no prediction: {found}; {why}")
-        about = _about(given, task.name, model, refused, seen.thread_problem())
-        worst = metrics.worst_frames()
-        photos = find_photos(given, {each.frame.stamp for each in worst})
-        shown: dict[str, Any] = {"target": metrics.target, "length": model.thread_length}
-        shown |= {"dish_diameter": about.dish_diameter, "simulated": bool(about.simulated)}
-        pictures = [draw_worst_frame(each, photos.get(each.frame.stamp), **shown) for each in worst]
-    page = write_page(about, metrics, figures, pictures)
-    progress(1.0)
-    return tables.row_of(about, figures), page
-
-
-def _targets(given: recorded.BagInput, against: str) -> list[str]:
-    """Return what the predictions are compared with.
-
-    Raises:
-        BagError: the bag does not hold it.
-    """
-    counts, targets = given.recording.counts, []
-    for target, channel in (("truth", interface.GROUND_TRUTH_THREAD), ("seen", interface.MEASURED_THREAD)):
-        if counts.get(channel.recorded) or (target == "seen" and given.source == "camera"):
-            targets.append(target)
-        elif against == target:
-            raise BagError(given.recording.path, f"has no messages on {channel.recorded} ({channel.type_name})")
-    return [target for target in targets if against in ("auto", target)]
-
-
-def _about(
-    given: recorded.BagInput, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str
-) -> BagDetails:
-    recording, setup = given.recording, given.setup
-    return BagDetails(
-        name=name,
-        path=one_line(str(recording.path)),
-        setup=setup.name,
-        simulated=recording.notes.get("simulated", ""),
-        source=given.source,
-        formulation=model.formulation,
-        length=model.thread_length,
-        segments=model.segments,
-        dish_diameter=setup.scene.dish.diameter,
-        start=recording.start,
-        begin=given.start,
-        duration=given.duration,
-        damage=tuple(str(place) for place in recording.damage.regions) if recording.damage else (),
-        unverified=recording.unverified,
-        refused=dict(refused.most_common()),
-        topics={
-            channel.recorded: (channel.type_name, recording.counts[channel.recorded])
-            for channel in CHANNELS
-            if recording.counts.get(channel.recorded)
-        },
-        settings=(*_settings(model), *_settings(setup.vision)),
-        remarks=(problem,) if problem else (),
-        software=_versions(),
+def bags_table(rows: Sequence[Any]) -> Any:
+    """Return the table of bags for a terminal: the figures that matter most, of estimate and prediction."""
+    columns = ("bag", "frames", "truth", "max", "measured", "max", "margin", "step")
+    cells: list[Sequence[str]] = []
+    for row in rows:
+        name = " ".join([str(row["bag"]), *(mark[0] for column, mark in MARKS.items() if row[column])])
+        if row["problem"]:
+            cells.append((name, "failed"))
+            continue
+        frames = f"{row['predicted']}/{row['frames']}"
+        margin, step = _number(row["least_obstacle_m"], 1e6, " µm"), _number(row["step_median_s"], 1e3, " ms")
+        cells.append((name, frames, *_errors(row["estimate"]), margin, step))
+        cells.append(("  predicted", "", *_errors(row["prediction"])))
+    if len(rows) > 1:
+        compared = tables.compare_bags(rows)
+        cells.append(("all bags", "", *_errors(compared["estimate"])))
+        cells.append(("  predicted", "", *_errors(compared["prediction"])))
+    caption = (
+        "errors in % of the length, mean and maximum over time; margin: least clearance of an obstacle, chords too"
     )
+    caption += "".join(f"; {mark}" for column, mark in MARKS.items() if any(row[column] for row in rows))
+    silences = [(row["silent_s"], row["max_silence_s"]) for row in rows if row["silences"]]
+    if silences:
+        total, longest = sum(silent for silent, _ in silences), max(gap for _, gap in silences)
+        caption += f" for {total:.1f} s, {longest:.1f} s at the longest"
+    return command.make_table("1 bag" if len(rows) == 1 else f"{len(rows)} bags", columns, cells, caption)
 
 
-def _settings(settings: Configuration) -> Iterator[tuple[str, str, str]]:
-    for field in configuration_fields(type(settings)):
-        value = getattr(settings, field.name)
-        shown = ", ".join(f"{entry}" for entry in value) if isinstance(value, tuple) else f"{value}"
-        yield f"{field.group}.{field.name}", shown, field.quantity.unit
+def _errors(errors: Any) -> list[str]:
+    names = (f"error_{of}_{which}_percent" for of in ("ground_truth", "measured") for which in ("mean", "max"))
+    return [_number(errors[name]) for name in names]
 
 
-def _versions() -> tuple[tuple[str, str], ...]:
-    found = []
-    for name in ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless"):
-        with suppress(PackageNotFoundError):  # as where Ubuntu's python3-opencv is in its place
-            found.append((name, version(name)))
-    return *found, ("Python", platform.python_version())
+def _number(value: Any, scale: float = 1.0, unit: str = "") -> str:
+    return "" if value is None else f"{scale * value:.3g}{unit}"
 
 
-def live_figures(recording: Recording, start: float, duration: float | None) -> LiveFigures:
-    """Return the latencies of a recorded graph: from a stamp to when the first message about it was recorded.
-
-    Args:
-        recording: the bag.
-        start: seconds into the bag to begin at.
-        duration: [s]; to the bag's end if None.
-
-    Raises:
-        BagError: the bag has changed since it was opened.
-    """
-    there = [channel for channel in LATENT if recording.counts.get(channel.recorded)]
-    if not there:
-        return LiveFigures()
-    if "replayed" in recording.notes:
-        return LiveFigures(remark="not measured: the bag was replayed")
-    latencies = {channel.recorded: array("d") for channel in there}
-    latest: dict[str, int] = {}
-    for record in recording.records(there, start=start, duration=duration):
-        stamp = _stamp(record)
-        if stamp > latest.get(record.topic, 0):  # the first about each
-            latest[record.topic] = stamp
-            latencies[record.topic].append((record.time - stamp) * 1e-9)
-    percentiles = {LATENT[channel]: Percentiles.of(latencies[channel.recorded]) for channel in there}
-    found = {stage: each for stage, each in percentiles.items() if each is not None}
-    if any(not 0.0 <= each.median <= 10.0 for each in found.values()):
-        return LiveFigures(remark="not measured: stamps and times of recording are of two clocks")
-    if all(each.maximum == 0.0 for each in found.values()):
-        return LiveFigures(remark="not measured: the bag was made offline")
-    return LiveFigures(found)
-
-
-def _stamp(record: RecordedMessage) -> int:
-    """Return the stamp of what a message answers [ns]; 0 for currents that answer no command or are broken."""
-    if record.topic != interface.CURRENTS.recorded:
-        return stamp_of(record)
-    try:
-        message = record.decode()
-    except BagError:
-        return 0
-    return 0 if message.stop else int(message.command.sec * 1_000_000_000 + message.command.nanosec)
-
-
-class RecordedPredictions:
-    """Gives the predictions that a bag holds, one by one, beside those made now; few are held at a time.
-
-    Args:
-        recording: the bag.
-        start: seconds into the bag to begin at.
-        duration: [s]; to the bag's end if None.
-    """
-
-    def __init__(self, recording: Recording, start: float, duration: float | None) -> None:
-        there = recording.counts.get(interface.PREDICTED_THREAD.recorded)
-        channels = [interface.PREDICTED_THREAD] if there else []
-        self._records = recording.records(channels, start=start, duration=duration)
-        self._held: dict[int, RecordedMessage] = {}
-        self._latest = -1
-
-    def of(self, stamp: int) -> Points | None:
-        """Return the recorded prediction of a frame, shape (n + 1, 2) [m]; None if there is none.
-
-        Args:
-            stamp: of the frame [ns], not before those asked for until now.
-        """
-        while self._latest < stamp and len(self._held) < 600:
-            record = next(self._records, None)
-            if record is None:
-                break
-            self._latest = max(self._latest, at := stamp_of(record))
-            if at >= stamp:  # those before were of frames that nobody asked for
-                self._held[at] = record
-        found = self._held.get(stamp)
-        self._held = {at: record for at, record in self._held.items() if at > stamp}
-        if found is None:
-            return None
-        try:
-            vertices = np.array([[point.x, point.y] for point in found.decode().positions])
-        except BagError:
-            return None
-        return vertices if vertices.shape[0] > 1 and np.isfinite(vertices).all() else None
+def references_table(evaluation: reference.Evaluation) -> Any:
+    """Return the scores of a set of trajectories as a table for a terminal."""
+    columns = ("case", "error", "max", "stretch [%]", "depth [m]", "step [µs]", "p99")
+    cells: list[Sequence[str]] = []
+    for case in evaluation.cases:
+        errors = (case.mean_error_percent, case.max_error_percent, 100.0 * case.max_stretch)
+        depth = f"{case.max_penetration_m:.0e}" if case.max_penetration_m else "none"
+        times = (f"{1e6 * time:.0f}" for time in (case.step_median_s, case.step_p99_s))
+        cells.append((case.name, *(f"{value:.3f}" for value in errors), depth, *times))
+    cells.append(("mean of the cases", f"{evaluation.mean_error_percent:.3f}"))
+    cells.append(("worst case", f"{evaluation.worst_error_percent:.3f}"))
+    residual = max(case.max_residual for case in evaluation.cases)
+    marked = sum(case.fallbacks for case in evaluation.cases)
+    caption = (
+        "errors in % of the length, mean and maximum over time; depth of a node in an obstacle; "
+        f"step: wall clock, median; largest residual {residual:.0e}, {marked} steps fell back or did not converge"
+    )
+    title = f"formulation {evaluation.formulation}, solver {evaluation.solver}"
+    return command.make_table(title, columns, cells, caption)

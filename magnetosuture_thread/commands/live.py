@@ -16,8 +16,7 @@ import yaml
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands import replay
-from magnetosuture_thread.evaluation import recorded
+from magnetosuture_thread.evaluation import recorded, replay
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, stage_latencies
 from magnetosuture_thread.evaluation.workers import Log, Progress

@@ -1,4 +1,4 @@
-"""Frames of a run, measured and predicted, and what is kept of them: columns, error map, worst frames."""
+"""Frames of a run, measured and predicted, and what is kept of them: columns and error map."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.estimator import Disturbance, SlowParameter, ThreadEstimate
+from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
@@ -19,9 +20,7 @@ from magnetosuture_thread.thread.prediction import Prediction
 
 Array = NDArray[np.float64]
 
-MIN_DISTANCE = 1.0  # s; between two of the worst frames
 MARGIN = "margin_"  # columns of margins, by the barrier's name
-BIN = 0.5  # s; of each bin the worst frame is kept
 SILENT_PERIODS = 5.0  # usual intervals; a longer one without frames is a gap
 
 
@@ -48,6 +47,7 @@ class Observation:
         processing: time that the tracker took for the frame [s]; nan where the poses were recorded.
         observation: what is seen of the thread; None where a bag holds the centreline alone.
         deviation: standard deviations of tail [m] and heading [rad]; zeros if not known.
+        recorded: the prediction that the bag holds of the frame, shape (n + 1, 2) [m]; no vertices if it holds none.
     """
 
     stamp: int
@@ -60,6 +60,7 @@ class Observation:
     observation: ThreadObservation | None = None
     deviation: tuple[float, float] = (0.0, 0.0)
     true_pull: Array = field(default_factory=_nothing)
+    recorded: Points = field(default_factory=_no_points)
 
     @property
     def found(self) -> bool:
@@ -77,7 +78,6 @@ class EstimatedThread:
         squared: normalised innovation squared of each window of arc length, shape (w,); nan where nothing is measured.
         disturbances: what the model does not know.
         hidden: part of the thread that no point shows, 0 to 1.
-        learned: slow parameters, where any are learned.
     """
 
     vertices: Points
@@ -85,14 +85,12 @@ class EstimatedThread:
     squared: Array = field(default_factory=_nothing)
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
-    learned: tuple[SlowParameter, ...] = ()
 
     @classmethod
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
         squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        learned = estimate.slow_parameters
-        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden, learned)
+        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
 
 
 @dataclass(kw_only=True)
@@ -108,7 +106,6 @@ class FrameResult(Observation):
         pull: of the thread upon the needle, shape (2,) [N]; shape (0,) where no force is known.
         margins: None if they prove nothing.
         obstacles: in force.
-        recorded: the prediction that the bag holds of the same frame, shape (n + 1, 2) [m].
         errors: prediction error by target, `truth` and `seen` [% of length]; set when it is computed.
         estimate: of the thread; None where there is none.
     """
@@ -121,7 +118,6 @@ class FrameResult(Observation):
     pull: Array = field(default_factory=_nothing)
     margins: Margins | None = None
     obstacles: tuple[Obstacle, ...] = ()
-    recorded: Points | None = None
     errors: dict[str, float] = field(default_factory=dict)
     estimate: EstimatedThread | None = None
 
@@ -135,7 +131,6 @@ class FrameResult(Observation):
         *,
         estimate: ThreadEstimate | None = None,
         estimated: bool = False,
-        recorded: Points | None = None,
         obstacles: tuple[Obstacle, ...] = (),
     ) -> FrameResult:
         """Return a prediction with the observation that it is of.
@@ -147,7 +142,6 @@ class FrameResult(Observation):
             step_time: that the prediction took [s].
             estimate: of the same frame.
             estimated: whether the thread is estimated in this run; without an estimate the prediction stands for it.
-            recorded: the prediction of the same frame that the bag holds.
             obstacles: in force.
         """
         instead = EstimatedThread(prediction.positions) if estimated else None
@@ -162,7 +156,6 @@ class FrameResult(Observation):
             pull=np.empty(0) if forces is None else np.asarray(forces.needle_force),
             margins=margins,
             obstacles=obstacles,
-            recorded=recorded,
             estimate=instead if estimate is None else EstimatedThread.of(estimate),
         )
 
@@ -235,52 +228,18 @@ class TimeSeries:
         return values[np.isfinite(values)]
 
 
-@dataclass(frozen=True)
-class WorstFrame:
-    """A frame in which the prediction, or the estimate, is far off.
+class WorstFrame(NamedTuple):
+    """The frame in which the prediction is farthest from what it is compared with.
 
     Attributes:
         time: since the bag's start [s].
-        error: of it [% of length].
+        error: of the prediction [% of length].
         frame: what was predicted, estimated, measured and true.
-        of: `prediction` or `estimate`.
     """
 
     time: float
     error: float
     frame: FrameResult
-    of: str = "prediction"
-
-
-class WorstFrames:
-    """Keeps the frames with the greatest errors, few of them however long the bag is.
-
-    Args:
-        count: of frames to find, `MIN_DISTANCE` apart.
-    """
-
-    def __init__(self, count: int = 5) -> None:
-        self._count = count
-        # A frame takes out the bins within MIN_DISTANCE of it, on both sides: no more of the worst bins are needed.
-        self._enough = count * (2 * math.ceil(MIN_DISTANCE / BIN) + 3)
-        self._bins: dict[int, WorstFrame] = {}
-
-    def add(self, frame: WorstFrame) -> None:
-        """Add one frame."""
-        bin_ = math.floor(frame.time / BIN)
-        if bin_ in self._bins and self._bins[bin_].error >= frame.error:
-            return
-        self._bins[bin_] = frame
-        if len(self._bins) > self._enough + 1:  # the bin that is being filled stays
-            del self._bins[min(self._bins.keys() - {bin_}, key=lambda other: self._bins[other].error)]
-
-    def found(self) -> list[WorstFrame]:
-        """Return the worst frames, the worst first."""
-        chosen: list[WorstFrame] = []
-        for worst in sorted(self._bins.values(), key=lambda worst: (-worst.error, worst.time)):
-            if all(abs(worst.time - other.time) >= MIN_DISTANCE for other in chosen):
-                chosen.append(worst)
-        return chosen[: self._count]
 
 
 def with_gaps(times: Array, values: Array) -> tuple[Array, Array]:

@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from magnetosuture_thread.estimator import SlowParameter
-from magnetosuture_thread.estimator.stiffness import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.evaluation.frames import (
-    MIN_DISTANCE,
     SILENT_PERIODS,
     Array,
     ErrorMap,
@@ -23,7 +20,6 @@ from magnetosuture_thread.evaluation.frames import (
     Observation,
     TimeSeries,
     WorstFrame,
-    WorstFrames,
 )
 from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
@@ -411,14 +407,12 @@ class EstimationFigures:
         consistency: of the innovations; None where no measurement went in.
         hidden: how much of the thread was hidden; None where nothing was estimated.
         disturbances: what the model does not know, by its beginning.
-        learned: slow parameters in the end, where any are learned.
     """
 
     corrected: int = 0
     consistency: Consistency | None = None
     hidden: HiddenShares | None = None
     disturbances: tuple[DisturbanceEvent, ...] = ()
-    learned: tuple[SlowParameter, ...] = ()
 
     @property
     def estimated(self) -> bool:
@@ -428,7 +422,6 @@ class EstimationFigures:
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none."""
         hidden, found = self.hidden, self.consistency
-        learned = self.learned[0] if self.learned else None
         return {
             "corrected_frames": self.corrected,
             "consistency": {
@@ -444,11 +437,6 @@ class EstimationFigures:
             "all_hidden_time_share": hidden.all_time if hidden else None,
             "hidden_length_share": hidden.length if hidden else None,
             "disturbances": len(self.disturbances),
-            "learned": {
-                STIFFNESS_OVER_DRAG: learned.value if learned else None,
-                f"{STIFFNESS_OVER_DRAG}_95_low": learned.low if learned else None,
-                f"{STIFFNESS_OVER_DRAG}_95_high": learned.high if learned else None,
-            },
         }
 
 
@@ -461,64 +449,51 @@ class RunMetrics:
         length: of the thread [m].
         start: time that is 0 in the figures [ns].
         targets: what the predictions are compared with, of `truth` and `seen`.
-        recorded: whether the predictions that the bag itself holds are compared too.
 
     Attributes:
+        length: as given [m].
         targets: as given, the better one first.
-        recorded: as given.
-        observed: column `processing` of all frames [s].
-        tracked: frames with a needle.
-        lost: from and to when the needle was not found, less than a second apart as one [s].
-        reasons: why not.
+        observed: columns `processing` [s] and `tracked`, 0 or 1, of all frames.
+        reasons: why the needle was not found in the others.
         contact_frames: those in which the thread touches an obstacle or the wall.
         disturbances: that the estimate reported; those with one beginning are one event.
-        learned: slow parameters of the last estimate that has any.
         series: columns of all frames with a prediction, by time.
     """
 
-    def __init__(
-        self, length: float, start: int = 0, targets: Iterable[str] = TARGETS, *, recorded: bool = False
-    ) -> None:
+    def __init__(self, length: float, start: int = 0, targets: Iterable[str] = TARGETS) -> None:
         self.targets = tuple(target for target in TARGETS if target in targets)
-        self.recorded = recorded
         self.series, self.observed = TimeSeries(), TimeSeries()
-        self.tracked = self.contact_frames = 0
-        self.lost: list[list[float]] = []
+        self.contact_frames = 0
         self.reasons: Counter[str] = Counter()
         self.disturbances: list[DisturbanceEvent] = []
-        self.learned: tuple[SlowParameter, ...] = ()
-        self._length, self._start = length, start
-        self._found, self._disturbed_since = True, math.nan
+        self.length, self._start = length, start
+        self._disturbed_since = math.nan
         self._minimum: dict[str, MinimumMargin] = {}
         self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
-        self._worst = {key: WorstFrames() for key in self._maps}
-        self._first: FrameResult | None = None
+        self._worst: dict[str, WorstFrame] = {}
 
     def observe(self, observation: Observation) -> None:
         """Count a frame, or a recorded pose, and whether its needle was found."""
-        time = self._time(observation.stamp)
-        self.observed.add(time, {"processing": observation.processing})
-        self.tracked += observation.found
+        columns = {"processing": observation.processing, "tracked": float(observation.found)}
+        self.observed.add(self._time(observation.stamp), columns)
         if not observation.found:
             reason = observation.reason or "not said"
             self.reasons[reason if reason in self.reasons or len(self.reasons) < 12 else "others"] += 1
-            # Two that are less than this apart look like one in a plot.
-            if self._found and not (self.lost and time - self.lost[-1][1] < MIN_DISTANCE):
-                self.lost.append([time, time])
-            self.lost[-1][1] = time
-        self._found = observation.found
+
+    @property
+    def tracked(self) -> int:
+        """Number of frames with a needle."""
+        return int(self.observed.column("tracked").sum())
 
     def add(self, frame: FrameResult) -> None:
         """Add the prediction of a frame, and set its errors."""
         time = self._time(frame.stamp)
-        self._first = self._first or frame
+        self._worst.setdefault("", WorstFrame(time, math.nan, frame))
         if frame.margins is not None:
             self.contact_frames += bool(frame.margins.in_contact)
             self._lower(time, frame.margins)
         self._take_disturbances(time, frame)
-        if frame.estimate is not None and frame.estimate.learned:
-            self.learned = frame.estimate.learned
-        columns = frame.columns() | {"hidden": hidden_part(frame, self._length)} | self._compare(time, frame)
+        columns = frame.columns() | {"hidden": hidden_part(frame, self.length)} | self._compare(time, frame)
         self.series.add(time, columns)
 
     def _lower(self, time: float, margins: Margins) -> None:
@@ -564,23 +539,23 @@ class RunMetrics:
             threads["estimate"] = frame.estimate.vertices
         for target in TARGETS:
             curve = frame.target_curve(target)
-            points, known = target_points(curve, self._length, len(frame.vertices) - 1)
+            points, known = target_points(curve, self.length, len(frame.vertices) - 1)
             if target == "seen":
-                row["seen_share"] = min(1.0, known / self._length)
+                row["seen_share"] = min(1.0, known / self.length)
             if target not in self.targets:
                 continue
-            frame.errors[target] = math.nan
-            for kind, vertices in threads.items() if known >= MIN_KNOWN_SHARE * self._length else ():
-                errors, column = node_errors(vertices, points, self._length), f"{KINDS[kind]}error_{target}"
+            for kind, vertices in threads.items() if known >= MIN_KNOWN_SHARE * self.length else ():
+                errors, column = node_errors(vertices, points, self.length), f"{KINDS[kind]}error_{target}"
                 there = errors[np.isfinite(points[:, 0])]
                 if not np.isfinite(there).all():
                     continue  # a prediction with a node that is nowhere
                 row[column], row[f"max_node_{column}"] = float(there.mean()), float(there.max())
                 self._maps[kind, target].add(time, errors)
-                self._worst[kind, target].add(WorstFrame(time, row[column], frame, kind))
-                frame.errors[target] = row[f"error_{target}"]
-            if frame.recorded is not None:
-                row[f"recorded_error_{target}"] = prediction_error_percent(frame.recorded, curve, self._length)
+            error = frame.errors[target] = row.get(f"error_{target}", math.nan)
+            if error > (self._worst[target].error if target in self._worst else -1.0):
+                self._worst[target] = WorstFrame(time, error, frame)
+            if len(frame.recorded):
+                row[f"recorded_error_{target}"] = prediction_error_percent(frame.recorded, curve, self.length)
         return row
 
     @property
@@ -598,19 +573,10 @@ class RunMetrics:
         """Return the map of the error along the thread, of `prediction` or `estimate`."""
         return self._maps.get((kind, self.target))
 
-    def worst_frames(self) -> list[WorstFrame]:
-        """Return the frames with the greatest errors of prediction, then of estimate, each time the worst first."""
-        if not self.target:
-            return []
-        found, others = (self._worst[kind, self.target].found() for kind in KINDS)
-        apart = [each for each in others if all(abs(each.time - one.time) >= MIN_DISTANCE for one in found)]
-        return found + apart[:2]
-
     @property
-    def worst_measured(self) -> FrameResult | None:
-        """The frame farthest from what was measured; where nothing was, from the truth, else the first one."""
-        worst = [each for target in reversed(self.targets) for each in self._worst["prediction", target].found()[:1]]
-        return worst[0].frame if worst else self._first
+    def worst(self) -> WorstFrame | None:
+        """The frame in which the prediction is farthest off; the first one where nothing is known, None without any."""
+        return self._worst.get(self.target)
 
     def errors(self, prefix: str = "error") -> dict[str, dict[str, float] | None]:
         """Return the figures of the columns `PREFIX_TARGET` by target; see `error_figures`."""
@@ -621,7 +587,7 @@ class RunMetrics:
         """What the run tells of its estimate beside the errors."""
         corrected = int(np.nansum(self.series.column("corrected")))
         consistency, hidden = Consistency.of(self.series), HiddenShares.of(self.series)
-        return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances), self.learned)
+        return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances))
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""

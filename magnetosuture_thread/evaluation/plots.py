@@ -1,12 +1,11 @@
-"""Plots and pictures of worst frames, evaluated trajectories and scenes; and colours, axes and scale of all plots."""
+"""Pictures, drawn without pyplot: of a run, and of scenes; colours, axes and scale of all pictures."""
 
 from __future__ import annotations
 
-import base64
 import io
+import itertools
+import math
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,33 +13,42 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation.figures import AGAINST, COLOURS, format_number
-from magnetosuture_thread.evaluation.frames import FrameResult, WorstFrame
-from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.metrics import node_errors, target_points
-from magnetosuture_thread.evaluation.reference import CaseResult
+from magnetosuture_thread.evaluation.frames import MARGIN, Array, FrameResult, WorstFrame, with_gaps
+from magnetosuture_thread.evaluation.metrics import RunMetrics, target_points
+from magnetosuture_thread.evaluation.tables import micrometres
+from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import KINDS, Scene
 from magnetosuture_thread.settings.errors import printable
+from magnetosuture_thread.thread.margins import SOLID
 
-SEEN, TRUTH, PREDICTED, ESTIMATED = (light for light, _ in COLOURS.values())
-INK, FAINT = TRUTH, "#7b8794"
+# Told apart by red-green blind readers too; as on the operator's page.
+SEEN, TRUTH, PREDICTED, ESTIMATED = "#2f7bff", "#1d2833", "#99107f", "#00a3a8"
+INK, FAINT, GOOD, BAD = TRUTH, "#7b8794", "#1f9d55", "#c8102e"
+AGAINST = {"truth": "ground truth", "seen": "the measured centreline"}
 KIND_COLOURS = {
     "tissue": ("#f0b9b4", "#b8665f"),
     "instrument": ("#b9c6d2", "#56697a"),
     "wall": ("#cbbfa9", "#6f624c"),
 }  # of a shape in a scene: face and edge
-BAD = "#c8102e"
-MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])  # from 0 to 1 mm
+MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", GOOD])  # from 0 to 1 mm
+ERROR_COLOURS = LinearSegmentedColormap.from_list("error", ["#f7f4f8", "#c994c7", PREDICTED, "#2b0726"])
+THREADS: tuple[tuple[str, str, float, float, Any], ...] = (
+    ("measured", SEEN, 5.0, 0.45, "solid"),
+    ("predicted from the needle's poses", PREDICTED, 3.0, 1.0, "solid"),
+    ("estimated with the camera", ESTIMATED, 1.7, 1.0, "solid"),
+    ("ground truth", TRUTH, 0.9, 1.0, (0, (4, 4))),
+)  # name, colour, width, opacity and dashes of each thread, the lowest first
 
 
 class Photo(NamedTuple):
@@ -55,114 +63,176 @@ class Photo(NamedTuple):
     view: DishView
 
 
-@dataclass(frozen=True)
-class ReportPicture:
-    """A picture of one of the worst frames.
-
-    Attributes:
-        worst: what is shown.
-        source: the picture as a data URI.
-        alt_text: what it shows, in words.
-        is_plan: whether it is a plan and no camera frame.
-    """
-
-    worst: WorstFrame
-    source: str
-    alt_text: str
-    is_plan: bool
+def make_figure(width: float, height: float, dpi: float = 110.0) -> Figure:
+    """Return an empty figure on a canvas of its own, whatever backend a notebook asks for [inch]."""
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
 
 
-def draw_summary(path: Path, photo: Photo, chosen: FrameResult, at: float, summary: ReplaySummary) -> None:
-    """Write the picture of a replay (.png): the dish and a close-up of a frame, with the threads in it.
+def draw_metrics(
+    metrics: RunMetrics, title: str, dish_diameter: float, photo: Photo | None = None, simulated: str = ""
+) -> bytes:
+    """Return the picture of a run (PNG): its worst frame, its errors over time and along the thread, its margins.
 
     Args:
-        path: of the picture.
-        photo: camera image of the chosen frame.
-        chosen: the frame to show.
-        at: its time since the bag's start [s].
-        summary: the figures, for the title.
-    """
-    found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
-    title = f"{Path(summary.bag).name}, setup {summary.setup}: {summary.tracked} of {summary.frames} {found}"
-    if summary.simulated:
-        title += f"\nsimulated: {summary.simulated}"
-    words = (
-        f"frame at {at:.2f} s, where the prediction is farthest from the measured thread\nwide: measured; magenta: "
-        "predicted; teal: estimated; dashed: ground truth; nodes: red at an obstacle to green 1 mm away"
-    )
-    figure = Figure(figsize=(14.0, 7.9), dpi=110, facecolor="white")
-    nearest = int(np.argmin(chosen.clearance)) if np.isfinite(chosen.clearance).any() else len(chosen.vertices) - 1
-    _draw_dish_and_close_up(figure, photo, chosen, chosen.vertices[nearest], 2e-3, height=0.86)
-    # With names from outside, and no mathematics in them.
-    lines = "\n".join(printable(line) for line in title.split("\n"))
-    figure.text(0.01, 0.985, lines, fontsize=12, color=INK, parse_math=False, va="top")
-    figure.text(0.01, 0.925, words, fontsize=9.5, color=INK, va="top")
-    figure.savefig(path)
-
-
-def draw_worst_frame(
-    worst: WorstFrame,
-    photo: Photo | None,
-    *,
-    target: str,
-    length: float,
-    dish_diameter: float,
-    simulated: bool = False,
-) -> ReportPicture:
-    """Draw one of the worst frames: the whole dish, and close by where prediction or estimate is farthest off.
-
-    Args:
-        worst: what to show.
-        photo: the camera's frame; without one a plan is drawn.
-        target: what the prediction is compared with, `truth` or `seen`.
-        length: of the thread [m].
+        metrics: of the run, with a prediction at least.
+        title: of the picture.
         dish_diameter: [m]
-        simulated: whether the frame is rendered.
+        photo: camera image of the worst frame; without one a plan is drawn.
+        simulated: what of the run is simulated.
     """
-    shown, frame = photo or draw_plan(dish_diameter), worst.frame
-    targets = target_points(frame.target_curve(target), length, len(frame.vertices) - 1)[0]
-    vertices = frame.vertices if worst.of == "prediction" or frame.estimate is None else frame.estimate.vertices
-    errors = node_errors(vertices, targets, length)
-    node = int(np.nanargmax(errors)) + 1
-    greatest = 0.01 * float(np.nanmax(errors)) * length
-    ends = np.vstack([vertices[node], targets[node - 1]])
-    figure = Figure(figsize=(12.0, 5.95), dpi=100, facecolor="#888e94")
-    half = max(0.08 * length, 0.75 * greatest)
-    scene, close = _draw_dish_and_close_up(figure, shown, frame, ends.mean(axis=0), half)
-    close.plot(*shown.view.to_pixels(ends).T, color=BAD, linewidth=1.6)
-    if simulated:
-        box = {"facecolor": "#fff3d6", "alpha": 0.85, "edgecolor": "none", "pad": 2.5}
-        scene.text(0.02, 0.98, "simulated", transform=scene.transAxes, color="#5c4300", fontsize=11, va="top", bbox=box)
-    kind = "Plan of the dish" if photo is None else "Simulated camera frame" if simulated else "Camera frame"
-    words = (
-        f"{kind} at {worst.time:.2f} s with the threads, and a close-up of node {node} of the {worst.of}, "
-        f"which is {format_number(1e3 * greatest)} mm from {AGAINST[target]}; "
-        f"error of the {worst.of} {format_number(worst.error)} % of the length."
-    )
+    worst, width, height = metrics.worst, 13.0, 13.9  # inch
+    assert worst is not None
+    figure = make_figure(width, height)
+
+    def place(left: float, top: float, wide: float, tall: float) -> Axes:
+        return figure.add_axes((left / width, 1.0 - (top + tall) / height, wide / width, tall / height))
+
+    text: dict[str, Any] = {"color": INK, "parse_math": False, "va": "top"}  # with names from outside
+    figure.text(0.25 / width, 1.0 - 0.12 / height, printable(title), fontsize=14, weight="bold", **text)
+    lines = _facts(metrics) + (f"\nsimulated: {printable(simulated)}" if simulated else "")
+    figure.text(0.25 / width, 1.0 - 0.42 / height, lines, fontsize=9.5, linespacing=1.45, **text)
+    dish, close = place(0.25, 1.6, 6.2, 6.2), place(6.55, 1.6, 6.2, 6.2)
+    _draw_frame(dish, close, worst, photo or draw_plan(dish_diameter), metrics, dish_diameter)
+    _draw_key(figure, place(10.9, 7.97, 1.85, 0.12), height)
+    panels = [place(0.75, 8.75 + 1.65 * row, 11.5, 1.2) for row in range(3)]
+    _draw_errors(panels[0], metrics)
+    _draw_along(panels[1], place(12.35, 10.4, 0.12, 1.2), metrics)
+    _draw_margins(panels[2], metrics)
+    times = np.concatenate([metrics.observed.times, metrics.series.times])
+    for axes in panels:
+        tidy(axes)
+        axes.set_xlim(times.min(), max(times.max(), times.min() + 1e-3))
+        axes.axvline(worst.time, color=INK, linewidth=0.9, linestyle=(0, (2, 2)))
+    panels[2].set_xlabel("time since the start of the bag [s]; dashed: the frame above; grey: no needle", fontsize=9)
+    return to_png(figure)
+
+
+def to_png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="jpeg", pil_kwargs={"quality": 84, "optimize": True})
-    source = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
-    return ReportPicture(worst, source, words, photo is None)
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
 
 
-def _draw_dish_and_close_up(
-    figure: Figure, photo: Photo, frame: FrameResult, middle: Points, half: float, height: float = 1.0
-) -> tuple[Axes, Axes]:
-    """Draw the whole dish to the left and a square about a point to the right, with half of its side in metres."""
-    view, (rows, columns) = photo.view, photo.image.shape[:2]
-    scene, close = (figure.add_axes((left, 0.0, 0.4985, height)) for left in (0.0, 0.5015))
-    for axes, magnified in ((scene, 1.0), (close, 1.8)):
-        draw_threads(axes, photo.image, view, frame, frame.obstacles, magnified)
-    half_side = 0.5 * min(rows, columns)
-    edge = half_side - 0.5
-    look_at(scene, np.clip(view.to_pixels(np.zeros(2)), edge, [columns - 1.0 - edge, rows - 1.0 - edge]), half_side)
-    at, reach = view.to_pixels(middle), half / view.metres_per_pixel
-    look_at(close, at, reach)
-    box: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.0, "linestyle": (0, (3, 2))}
-    scene.add_patch(Rectangle((at[0] - reach, at[1] - reach), 2.0 * reach, 2.0 * reach, **box))
-    for axes, share in ((scene, 0.25), (close, 0.4)):
+def _facts(metrics: RunMetrics) -> str:
+    """Return frames, extremes and errors of a run, a line each."""
+    facts = [f"thread predicted in {len(metrics.series)} frames"]
+    if count := len(metrics.observed):
+        facts.insert(0, f"needle found in {metrics.tracked} of {count} frames")
+    facts.append(f"strain of a segment at most {100.0 * metrics.maximum('strain'):.2g} %")
+    if math.isfinite(tension := metrics.maximum("tension")):
+        facts.append(f"tension at most {1e6 * tension:.3g} µN")
+    if metrics.minimum_margins:
+        facts.append(f"an obstacle touched in {metrics.contact_frames} frames")
+    lines = ["; ".join(facts)]
+    for kind, prefix in (("prediction", "error"), ("estimate", "estimate_error")):
+        errors = [
+            f"{figures['mean']:.3g} % from {AGAINST[target]} (maximum {figures['maximum']:.3g} %)"
+            for target, figures in metrics.errors(prefix).items()
+            if figures is not None
+        ]
+        if errors:
+            lines.append(f"mean distance of the {kind}, in % of the length: {'; '.join(errors)}")
+    return "\n".join(lines)
+
+
+def _draw_frame(
+    dish: Axes, close: Axes, worst: WorstFrame, photo: Photo, metrics: RunMetrics, dish_diameter: float
+) -> None:
+    """Draw the dish with the threads of a frame, and a close-up of the node that is farthest off."""
+    frame, view = worst.frame, photo.view
+    targets = target_points(frame.target_curve(metrics.target), metrics.length, len(frame.vertices) - 1)[0]
+    errors = np.linalg.norm(frame.vertices[1:] - targets, axis=1)
+    node = int(np.nanargmax(errors)) + 1 if np.isfinite(errors).any() else len(frame.vertices) - 1
+    reach = 0.11 * metrics.length
+    words = f"close-up of node {node}"
+    ends = frame.vertices[node : node + 1]
+    if metrics.target:
+        words += f", {1e3 * errors[node - 1]:.3g} mm from {AGAINST[metrics.target]}"
+        ends, reach = np.vstack([ends, targets[node - 1]]), max(reach, 0.75 * errors[node - 1])
+    for axes, magnified in ((dish, 1.0), (close, 1.8)):
+        draw_threads(axes, photo.image, view, frame, magnified)
+    look_at(dish, view.to_pixels(np.zeros(2)), 0.52 * dish_diameter / view.metres_per_pixel)
+    middle, half = view.to_pixels(ends.mean(axis=0)), reach / view.metres_per_pixel
+    look_at(close, middle, half)
+    close.plot(*view.to_pixels(ends).T, color=BAD, linewidth=1.8, zorder=4)
+    frame_style: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.0, "linestyle": (0, (3, 2))}
+    dish.add_patch(Rectangle((middle[0] - half, middle[1] - half), 2.0 * half, 2.0 * half, **frame_style))
+    titles = f"frame at {worst.time:.2f} s, with the greatest error of the prediction", words
+    for axes, share, title in zip((dish, close), (0.25, 0.4), titles, strict=True):
         draw_scale_bar(axes, view.metres_per_pixel, share)
-    return scene, close
+        axes.set_title(title, fontsize=10, color=INK, loc="left", pad=4)
+
+
+def _draw_key(figure: Figure, bar: Axes, height: float) -> None:
+    """Draw what lines and colours of nodes mean, below the frame."""
+    handles = [
+        Line2D([], [], label=label, color=colour, linewidth=width, alpha=alpha, linestyle=dashes)
+        for label, colour, width, alpha, dashes in THREADS
+    ]
+    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.018, 1.0 - 7.85 / height), "ncols": 4}
+    figure.legend(handles=handles, fontsize=9.5, frameon=False, labelcolor=INK, **place)
+    colours = ScalarMappable(Normalize(0.0, 1.0), MARGIN_COLOURS)
+    scale = figure.colorbar(colours, cax=bar, orientation="horizontal", ticks=(0.0, 0.5, 1.0))
+    scale.set_label("nodes: to an obstacle [mm]", fontsize=8.5, color=INK, labelpad=1)
+    scale.ax.tick_params(labelsize=8, colors=INK, length=2, pad=1)
+
+
+def _draw_errors(axes: Axes, metrics: RunMetrics) -> None:
+    """Draw the errors of prediction and estimate over time, in the colours of their threads."""
+    kinds = (("recorded_error", FAINT), ("error", PREDICTED), ("estimate_error", ESTIMATED))
+    for prefix, colour in kinds:
+        for target, dashes in (("truth", "solid"), ("seen", (0, (1, 1)))):
+            times, errors = with_gaps(metrics.series.times, metrics.series.column(f"{prefix}_{target}"))
+            axes.plot(times, errors, color=colour, linewidth=1.3, linestyle=dashes)
+    observed, tracked = metrics.observed.times, metrics.observed.column("tracked")
+    grey: dict[str, Any] = {"color": FAINT, "alpha": 0.25, "linewidth": 0.0, "step": "post"}
+    axes.fill_between(observed, 0.0, 1.0, tracked == 0.0, transform=axes.get_xaxis_transform(), **grey)
+    title = (
+        f"mean distance of the nodes [% of the length]; solid: from {AGAINST['truth']}, dotted: from {AGAINST['seen']}"
+    )
+    if len(metrics.series.known("recorded_error_truth")) or len(metrics.series.known("recorded_error_seen")):
+        title += "; grey lines: of the recorded prediction"
+    axes.set_title(title, fontsize=9.5, color=INK, loc="left")
+    axes.set_ylim(bottom=0.0)
+
+
+def _draw_along(axes: Axes, bar: Axes, metrics: RunMetrics) -> None:
+    """Draw the error of the prediction along the thread over time."""
+    against = AGAINST.get(metrics.target, "nothing that is known")
+    title = f"distance of the prediction from {against} [% of the length], by arc length from the needle's tail [mm]"
+    axes.set_title(title, fontsize=9.5, color=INK, loc="left")
+    errors = metrics.error_map()
+    grid = errors.grid() if errors is not None else None
+    if grid is None or grid[2].shape[1] < 2:
+        bar.set_axis_off()
+        return
+    times, lengths, values = grid
+    mesh = axes.pcolormesh(times, 1e3 * lengths, values, cmap=ERROR_COLOURS, vmin=0.0, shading="nearest")
+    scale = axes.figure.colorbar(mesh, cax=bar)
+    scale.ax.tick_params(labelsize=8, colors=INK, length=2, pad=1)
+
+
+def _draw_margins(axes: Axes, metrics: RunMetrics) -> None:
+    """Draw the least distance of obstacles and wall, and the margins of a user's barriers, over time."""
+    minima = [
+        f"{name.replace('_', ' ')} {micrometres(least.promised)}" for name, least in metrics.minimum_margins.items()
+    ]
+    title = "margins [mm], chords between nodes too; least of nodes: " + (", ".join(minima) or "not known")
+    axes.set_title(printable(title), fontsize=9.5, color=INK, loc="left", parse_math=False)
+    added = [name for name in metrics.minimum_margins if name not in BUILT_IN]
+    for name, colour in zip((*SOLID, *added), itertools.cycle((GOOD, "#56697a", "#f28c28", SEEN)), strict=False):
+        times, margins = with_gaps(metrics.series.times, 1e3 * metrics.series.column(f"{MARGIN}{name}"))
+        if np.isfinite(margins).any():
+            axes.plot(times, margins, color=colour, linewidth=1.3, label=printable(name.replace("_", " ")))
+    axes.axhline(0.0, color=BAD, linewidth=0.8)
+    axes.margins(y=0.12)
+    axes.set_yscale("symlog", linthresh=0.01)  # mm, so that a margin of a micrometre shows beside the dish's width
+    axes.yaxis.set_major_formatter("{x:g}")
+    if len(axes.lines) > 1:
+        axes.legend(loc="lower right", ncols=4, fontsize=8.5, frameon=False, labelcolor=INK)
 
 
 def draw_plan(dish_diameter: float) -> Photo:
@@ -176,37 +246,28 @@ def draw_plan(dish_diameter: float) -> Photo:
 
 
 def draw_threads(
-    axes: Axes,
-    frame: NDArray[np.uint8],
-    view: DishView,
-    chosen: FrameResult,
-    obstacles: Sequence[Obstacle],
-    magnified: float,
+    axes: Axes, image: NDArray[np.uint8], view: DishView, frame: FrameResult, magnified: float = 1.0
 ) -> None:
-    """Draw a frame, obstacles, and the threads that there are, without axes.
+    """Draw a camera frame, obstacles, and the threads that there are, without axes.
 
     The measured thread is wide, the predicted one a line below the estimated one, the ground truth dashed. The nodes
     of the estimated thread, else of the predicted one, have the colours of their margins.
     """
-    axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
+    axes.imshow(image[:, :, ::-1] if image.ndim == 3 else image, cmap="gray", vmin=0, vmax=255, aspect="equal")
     axes.set_axis_off()
-    to_frame = Affine2D().scale(1e-3 / view.metres_per_pixel).rotate(view.rotation).scale(1.0, -1.0)
-    to_pixels = to_frame.translate(*view.centre_px) + axes.transData
-    for obstacle in obstacles:
+    to_image = Affine2D().scale(1e-3 / view.metres_per_pixel).rotate(view.rotation).scale(1.0, -1.0)
+    to_pixels = to_image.translate(*view.centre_px) + axes.transData
+    for obstacle in frame.obstacles:
         if isinstance(obstacle, (Disc, Polygon)):
             axes.add_patch(shape_patch(obstacle, fill=False, edgecolor=INK, linewidth=0.9, transform=to_pixels))
-    nodes = chosen.vertices if chosen.estimate is None else chosen.estimate.vertices
-    for points, colour, width, alpha, dashes in (
-        (chosen.measured, SEEN, 5.0, 0.45, "solid"),
-        (chosen.vertices, PREDICTED, 3.0, 1.0, "solid"),
-        (nodes if chosen.estimate is not None else nodes[:0], ESTIMATED, 1.7, 1.0, "solid"),
-        (chosen.ground_truth, TRUTH, 0.9, 1.0, (0, (4, 4))),
-    ):
+    nodes = frame.vertices if frame.estimate is None else frame.estimate.vertices
+    threads = (frame.measured, frame.vertices, nodes if frame.estimate is not None else nodes[:0], frame.ground_truth)
+    for points, (_, colour, width, alpha, dashes) in zip(threads, THREADS, strict=True):
         style: dict[str, Any] = {"color": colour, "linewidth": width * magnified, "alpha": alpha, "linestyle": dashes}
         axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
-    close = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, 1.0)
+    near = np.clip(1e3 * frame.clearance[: len(nodes)], 0.0, 1.0)
     u, v = view.to_pixels(nodes).T
-    axes.scatter(u, v, s=9.0 * magnified**2, color=MARGIN_COLOURS(close), linewidths=0.0, zorder=2.5)
+    axes.scatter(u, v, s=9.0 * magnified**2, color=MARGIN_COLOURS(near), linewidths=0.0, zorder=2.5)
 
 
 def look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
@@ -234,42 +295,6 @@ def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
     axes.text(x, y, f"{1e3 * bar:g} mm", color=INK, fontsize=11, ha="left", va="bottom", bbox=box)
 
 
-def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
-    """Write the picture of one evaluated trajectory (.png): the thread at some instants, and the error over time."""
-    figure = Figure(figsize=(11.0, 5.6), dpi=130, facecolor="white")
-    scene, error = figure.subplots(
-        1, 2, gridspec_kw={"width_ratios": [1.25, 1.0], "left": 0.06, "right": 0.985, "top": 0.83, "bottom": 0.1}
-    )
-    reference, score, worst = case.reference, case.score, int(case.error_percent.argmax())
-    title = printable(f"{reference.name}, formulation {formulation}")
-    figure.text(0.02, 0.945, title, fontsize=13, color=INK, weight="bold", parse_math=False)
-    words = (
-        f"wide: the reference, simulated by another method; magenta: predicted, n = {case.vertices.shape[1] - 1}; "
-        f"mean error {score.mean_error_percent:.3f} % of the length, maximum {score.max_error_percent:.3f} %"
-    )
-    figure.text(0.02, 0.9, words, fontsize=9.5, color=INK)
-    scene.plot(*(1e3 * reference.tails.T), color=FAINT, linewidth=0.7, alpha=0.6)
-    for disc in reference.discs:
-        scene.add_patch(shape_patch(disc, facecolor="#e9d8d3", edgecolor=INK, linewidth=0.8))
-    for k in sorted({*np.linspace(0, len(reference.times) - 1, 6).astype(int).tolist(), worst}):
-        measured, tail = 1e3 * reference.threads[k], 1e3 * reference.threads[k][0]
-        scene.plot(*measured.T, color=SEEN, alpha=0.35, linewidth=5.0, solid_capstyle="round")
-        scene.plot(*(1e3 * case.vertices[k].T), color=PREDICTED, linewidth=1.0, marker="o", markersize=1.6)
-        scene.plot(*tail, "o", color=INK, markersize=4)
-        label = f"{reference.times[k]:.0f} s"
-        scene.annotate(label, tail, xytext=(5, 4), textcoords="offset points", fontsize=8, color=INK)
-    scene.set_aspect("equal", adjustable="datalim")
-    scene.set_title("threads and the needle's way [mm]", fontsize=9.5, color=INK, loc="left")
-    error.plot(reference.times, case.error_percent, color=PREDICTED, linewidth=1.3)
-    error.plot(reference.times[worst], case.error_percent[worst], "o", color=INK, markersize=4)
-    error.set_ylim(0.0, 1.15 * max(float(case.error_percent.max()), 1e-6))
-    error.set_xlabel("time [s]", color=INK)
-    error.set_title("mean distance of the nodes [% of the length]", fontsize=9.5, color=INK, loc="left")
-    for axes in (scene, error):
-        tidy(axes)
-    figure.savefig(path)
-
-
 def tidy(axes: Axes) -> None:
     """Give a plot the look of all of ours."""
     axes.grid(True, color="#e4e8ec", linewidth=0.7)
@@ -292,8 +317,7 @@ def plot_scene(path: Path, scene: Scene, name: str) -> None:
     # The same scene gives the same bytes; in SVG, text stays text.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": scene.version}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # of a name in a script that the font does not have
-        figure = Figure(figsize=(7.0, 7.45), dpi=150)
-        FigureCanvasAgg(figure)
+        figure = make_figure(7.0, 7.45, 150.0)
         _draw_scene(figure.add_axes((0.0, 0.0, 1.0, 7.0 / 7.45)), scene)
         dish = f"dish of {1e3 * scene.dish.diameter:g} mm, {1e3 * scene.dish.depth:g} mm deep"
         style: dict[str, Any] = {"color": INK, "parse_math": False, "va": "top"}
@@ -303,13 +327,11 @@ def plot_scene(path: Path, scene: Scene, name: str) -> None:
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
-    draw_empty_dish(axes, scene, 0.12)
+    draw_shapes(axes, scene, 0.12)
     axes.plot([0.0], [0.0], "+", color=FAINT, markersize=9.0, markeredgewidth=0.8, zorder=1)
     ground = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
     text: dict[str, Any] = {"bbox": ground, "ha": "center", "fontsize": 9.5, "color": INK, "parse_math": False}
     for shape in scene.shapes:
-        face, edge = KIND_COLOURS[shape.kind]
-        axes.add_patch(shape_patch(shape.geometry, facecolor=face, edgecolor=edge, linewidth=1.0, zorder=2, alpha=0.9))
         left, bottom, right, top = (1e3 * value for value in shape.solid.bounds)
         x, y = (1e3 * value for value in shape.label_point)
         name = axes.text(x, y, shape.name, va="center", zorder=5, **text)
@@ -323,13 +345,23 @@ def _draw_scene(axes: Axes, scene: Scene) -> None:
         axes.legend(handles=faces, loc="lower right", fontsize=9, frameon=False, labelcolor=INK)
 
 
-def draw_empty_dish(axes: Axes, scene: Scene, border: float) -> None:
-    """Draw an empty dish in millimetres, without axes, with a border around it as a share of its radius."""
+def draw_shapes(axes: Axes, scene: Scene, border: float = 0.08) -> None:
+    """Draw dish and shapes in millimetres, without axes, with a border around the dish as a share of its radius."""
     radius = 1e3 * scene.dish.radius
     axes.add_patch(Circle((0.0, 0.0), radius, facecolor="#f4f1ec", edgecolor="#8f877b", linewidth=2.0, zorder=0))
+    for shape in scene.shapes:
+        face, edge = KIND_COLOURS[shape.kind]
+        axes.add_patch(shape_patch(shape.geometry, facecolor=face, edgecolor=edge, linewidth=1.0, alpha=0.9))
     reach = (1.0 + border) * radius
     axes.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
     axes.set_axis_off()
+
+
+def draw_arrow(axes: Axes, at: Array, along: Array, style: Any = "solid") -> None:
+    """Draw an arrow from a point along a vector, in the units of the axes; none where that is zero."""
+    if along.any():
+        arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "linestyle": style}
+        axes.annotate("", xy=tuple(at + along), xytext=tuple(at), arrowprops=arrow)
 
 
 def shape_patch(geometry: Disc | Polygon, **style: Any) -> Circle | PathPatch:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 import zipfile
 import zlib
@@ -10,25 +11,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
+from magnetosuture_thread.evaluation.frames import FrameResult
+from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics, node_errors
 from magnetosuture_thread.evaluation.workers import Progress
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
 from magnetosuture_thread.thread.paper import PaperOptions
-from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.program import SOLVED
 
 # What numpy and json raise on files that are something else.
-NOT_ONE = (
+MALFORMED = (
     *(OSError, ValueError, TypeError, AttributeError, LookupError, EOFError, MemoryError, RecursionError),
     *(zipfile.BadZipFile, zlib.error),
 )
@@ -82,14 +86,14 @@ def read_reference(path: Path) -> ReferenceTrajectory:
         packed.seek(0)
         with np.load(packed, allow_pickle=False) as data:
             times, poses, threads = (np.asarray(data[key], dtype=np.float64) for key in ("t", "pose", "X"))
-            if "unit" in data:  # as `write_reference` packs it
+            if "unit" in data:  # packed: differences in time, in whole units
                 threads = float(data["unit"]) * np.cumsum(threads, axis=0)
             metadata = json.loads(str(data["meta"]))
         obstacle = metadata.get("obstacle")
         discs = (Disc((float(obstacle["cx"]), float(obstacle["cy"])), float(obstacle["R"])),) if obstacle else ()
     except FileNotFoundError:
         raise BagError(path, "does not exist; expected a reference trajectory (.npz)") from None
-    except NOT_ONE as error:
+    except MALFORMED as error:
         problem = " ".join(str(error).split())
         raise BagError(path, f"is no reference trajectory with the keys t, pose, X, meta: {problem}") from None
     count = times.size
@@ -102,21 +106,6 @@ def read_reference(path: Path) -> ReferenceTrajectory:
         raise BagError(path, "has times that do not increase, or values that are not finite")
     name = str(metadata.get("name", path.stem))
     return ReferenceTrajectory(name, times, poses[:, :2], poses[:, 2], threads, discs, metadata)
-
-
-def write_reference(reference: ReferenceTrajectory, path: Path, segments: int) -> None:
-    """Write a trajectory in a tenth of the bytes: the thread's nodes in whole units of 1e-5 L, by their changes.
-
-    Args:
-        reference: to write.
-        path: of the .npz file.
-        segments: n of the model that it is compared with, whose n + 1 nodes are kept.
-    """
-    nodes = np.stack([resampled(curve, segments) for curve in reference.threads])
-    unit = 1e-5 * float(reference.metadata["material"]["L_m"])
-    changes = np.diff(np.rint(nodes / unit).astype(np.int32), axis=0, prepend=np.int32(0))
-    poses, meta = np.column_stack([reference.tails, reference.headings]), json.dumps(reference.metadata)
-    np.savez_compressed(path, t=reference.times, pose=poses, X=changes, unit=unit, meta=meta)
 
 
 @dataclass(frozen=True)
@@ -197,6 +186,18 @@ class CaseResult:
     error_percent: NDArray[np.float64]
     score: CaseScore
 
+    @property
+    def metrics(self) -> RunMetrics:
+        """The trajectory as the metrics of a run, for its picture."""
+        segments, stamps = self.vertices.shape[1] - 1, np.rint(1e9 * self.reference.times).astype(np.int64)
+        metrics = RunMetrics(float(self.reference.metadata["material"]["L_m"]), int(stamps[0]), ("truth",))
+        for stamp, nodes, thread in zip(stamps.tolist(), self.vertices, self.reference.threads, strict=True):
+            lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
+            strain = float(np.abs(lengths * segments / metrics.length - 1.0).max())
+            obstacles = self.reference.discs
+            metrics.add(FrameResult(stamp, vertices=nodes, ground_truth=thread, strain=strain, obstacles=obstacles))
+        return metrics
+
 
 def find_references(folder: Path) -> list[Path]:
     """Return the trajectories of a folder, in the order of their names.
@@ -252,17 +253,14 @@ def score(
         initial = resampled(reference.threads[0], thread.segments)
         predictor.start_at(poses[0], initial)
 
-        def step(index: int) -> Prediction:
-            return predictor.step(poses[index])
+        def step(index: int) -> StepFigures:
+            prediction = predictor.step(poses[index])
+            strain, is_fallback = float(prediction.strain.max()), prediction.status != SOLVED
+            return StepFigures(prediction.positions, strain, prediction.residual, int(is_fallback))
 
-        return run_case(reference, initial, thread.length, thread.diameter, step, _figures, share)
+        return run_case(reference, initial, thread.length, thread.diameter, step, share)
 
     return Evaluation(formulation, solver, score_each(paths, score_case, progress, keep))
-
-
-def _figures(prediction: Prediction) -> StepFigures:
-    is_fallback = prediction.status != SOLVED
-    return StepFigures(prediction.positions, float(prediction.strain.max()), prediction.residual, int(is_fallback))
 
 
 def score_each(
@@ -310,16 +308,12 @@ class StepFigures(NamedTuple):
     fallbacks: int
 
 
-_StepResult = TypeVar("_StepResult")
-
-
 def run_case(
     reference: ReferenceTrajectory,
     initial: Points,
     length: float,
     diameter: float,
-    step: Callable[[int], _StepResult],
-    figures: Callable[[_StepResult], StepFigures],
+    step: Callable[[int], StepFigures],
     progress: Progress,
 ) -> CaseResult:
     """Step a thread along a reference trajectory and score it.
@@ -330,7 +324,6 @@ def run_case(
         length: of the thread [m].
         diameter: of the thread [m].
         step: goes to a sample, given by its index; this alone is timed.
-        figures: reads what a step gave.
         progress: called with the share done, 0 to 1.
 
     Source: reference set, "How a prediction is scored". Deviation: none.
@@ -338,9 +331,8 @@ def run_case(
     count, steps, took = len(reference.times), [], []
     for k in range(1, count):
         began = time.perf_counter()
-        result = step(k)
+        steps.append(step(k))
         took.append(time.perf_counter() - began)
-        steps.append(figures(result))
         if k % 50 == 0:
             progress(k / count)
     vertices = np.array([initial, *(each.vertices for each in steps)])
@@ -365,6 +357,72 @@ def run_case(
     return CaseResult(reference, vertices, error, score)
 
 
+def score_rig(
+    paths: Sequence[Path],
+    segments: int | None = None,
+    progress: Progress = lambda share: None,
+    keep: Callable[[CaseResult], None] = lambda result: None,
+) -> Evaluation:
+    """Move the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
+
+    Of the scores, `max_residual` is in units of the drag across the whole thread at the case's greatest speed, and
+    `fallbacks` counts steps that had to be halved.
+
+    Args:
+        paths: the trajectories.
+        segments: n, 100 unless given.
+        progress: called with the share done, 0 to 1.
+        keep: called with each case's result.
+
+    Raises:
+        BagError: a file is no reference trajectory.
+        SolverError: a step could not be solved.
+    """
+    count = segments or 100
+    # Of a needle whose motion is given, the body does not matter.
+    body = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
+
+    def score_case(trajectory: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
+        thread = _rig_thread(trajectory, path, count)
+        first, length = trajectory.threads[0], thread.length
+        if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - trajectory.tails[0]) > 0.1 * length / count:
+            raise BagError(path, "has a first thread of one point, or one that does not begin at the needle's tail")
+        if thread.diameter >= length:
+            raise BagError(path, f"has a thread of {thread.diameter:g} m in diameter, expected less than its length")
+        surface, heading = Surface(discs=trajectory.discs), float(trajectory.headings[0])
+        rig = RigDynamics(body, thread, surface, None, trajectory.tails[0], heading, first)
+        speed = np.linalg.norm(np.diff(trajectory.tails, axis=0), axis=1) / np.diff(trajectory.times)
+        force = thread.drag_across * length * max(float(speed.max()), 1e-6)
+
+        def step(index: int) -> StepFigures:
+            interval = trajectory.times[index] - trajectory.times[index - 1]
+            rig.drive(trajectory.tails[index], float(trajectory.headings[index]), interval)
+            strain = max(0.0, float(rig.tension.max()) / thread.stretching_stiffness)
+            return StepFigures(rig.thread, strain, rig.residual / force, rig.halvings)
+
+        return run_case(trajectory, rig.thread, length, thread.diameter, step, share)
+
+    return Evaluation("rig", "newton", score_each(paths, score_case, progress, keep))
+
+
+def _rig_thread(trajectory: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
+    """Return the thread that a trajectory's metadata describes.
+
+    Raises:
+        BagError: the metadata lacks something, or holds what is none.
+    """
+    names = ("L_m", "EI_Nm2", "EA_N", "zeta_perp_Pa_s", "zeta_par_Pa_s", "diameter_m")
+    try:
+        material = trajectory.metadata["material"]
+        length, bending, stretching, across, along, diameter = values = [float(material[name]) for name in names]
+        attachment = {"pinned": NeedleJoint.PINNED, "clamped": NeedleJoint.CLAMPED}[trajectory.metadata["boundary"]]
+    except MALFORMED as error:
+        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
+    if not all(math.isfinite(value) and value > 0.0 for value in values):
+        raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
+    return ThreadProperties(length, segments, bending, stretching, across, along, attachment, diameter=diameter)
+
+
 def reference_thread(
     reference: ReferenceTrajectory, path: Path, segments: int | None = None
 ) -> tuple[Thread, PaperOptions]:
@@ -376,19 +434,19 @@ def reference_thread(
         BagError: the metadata lacks something, or holds what is none.
     """
     try:
-        given = reference.metadata["material"]
-        kind = str(given["kind"])
+        material = reference.metadata["material"]
+        kind = str(material["kind"])
         attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
         thread = Thread(
             material=kind,
-            length=float(given["L_m"]),
-            segments=segments or int(given["paper_nodes"]),
-            diameter=float(given["diameter_m"]),
-            bending_stiffness=float(given["EI_Nm2"]),
-            medium=Medium(float(given["zeta_perp_Pa_s"]), float(given["zeta_par_Pa_s"])),
+            length=float(material["L_m"]),
+            segments=segments or int(material["paper_nodes"]),
+            diameter=float(material["diameter_m"]),
+            bending_stiffness=float(material["EI_Nm2"]),
+            medium=Medium(float(material["zeta_perp_Pa_s"]), float(material["zeta_par_Pa_s"])),
             attachment=attachment,
         )
-    except (*NOT_ONE, ConfigurationError) as error:
+    except (*MALFORMED, ConfigurationError) as error:
         raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
     if not thread.bending_stiffness * thread.medium.drag_along > 0.0:
         raise BagError(path, "has a thread whose stiffness or drag are not positive")
@@ -398,5 +456,5 @@ def reference_thread(
 
 def resampled(curve: Points, segments: int) -> Points:
     """Return n + 1 points of a curve whose own points are equally spaced in arc length."""
-    given, wanted = np.linspace(0.0, 1.0, len(curve)), np.linspace(0.0, 1.0, segments + 1)
-    return np.column_stack([np.interp(wanted, given, curve[:, axis]) for axis in range(curve.shape[1])])
+    places, wanted = np.linspace(0.0, 1.0, len(curve)), np.linspace(0.0, 1.0, segments + 1)
+    return np.column_stack([np.interp(wanted, places, curve[:, axis]) for axis in range(curve.shape[1])])

@@ -1,20 +1,19 @@
-"""Evaluating bags: pages and table, whatever becomes of one of the bags."""
+"""Evaluating bags: pictures and table, whatever becomes of one of the bags."""
 
 from __future__ import annotations
 
 import csv
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread import cli
+from magnetosuture_thread import cli, replay_offline
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
-from magnetosuture_thread.commands.replay import replay_offline
+from magnetosuture_thread.evaluation import plots
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.settings.interface import NEEDLE_POSE, PREDICTED_THREAD
 from test.bags.bags import copy_with_notes
@@ -27,9 +26,9 @@ def broken(path: Path) -> Path:
     return path
 
 
-def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
+def test_a_bag_gets_a_picture_and_a_row(tmp_path: Path, short_bag: Path):
     (row,) = evaluate_bags([short_bag], tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"pull.html", "table.csv", "table.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"pull.png", "table.json"}
     assert row["bag"] == "pull"
     assert row["setup"] == "petri_35mm_polyamide"
     assert "straight_pull" in str(row["simulated"])
@@ -38,36 +37,35 @@ def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
     assert 0.0 < float(str(row["error_seen_mean_percent"])) < 1.0
     assert row["recorded_error_truth_frames"] == 0
     assert json.loads((tmp_path / "out" / "table.json").read_text())["bags"] == [row]
-    page = (tmp_path / "out" / "pull.html").read_text()
-    assert "28 of 30" in page
-    assert page.count("data:image/jpeg;base64,") == 1
-    assert "Simulated camera frame at" in page
+    assert (tmp_path / "out" / "pull.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_picture_that_fails_costs_no_results(tmp_path: Path, short_bag: Path, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> bytes:
+        raise ValueError("no font")
+
+    monkeypatch.setattr(plots, "draw_metrics", fail)
+    lines: list[str] = []
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", duration=0.4, log=lines.append)
+    assert "pull: no picture: ValueError: no font" in lines
+    assert json.loads((tmp_path / "out" / "table.json").read_text())["bags"] == [row]
+    assert row["problem"] == ""
+    replay_offline(short_bag, tmp_path / "replay", duration=0.4, log=lines.append)
+    assert {path.name for path in (tmp_path / "replay").iterdir()} == {"bag", "summary.json"}
 
 
 def test_what_is_wrong_with_one_bag_is_in_its_row_and_ends_with_1(tmp_path: Path, short_bag: Path, capsys):
     bags = [str(broken(tmp_path / "=x")), str(short_bag), str(shutil.copytree(short_bag, tmp_path / "again" / "pull"))]
     output = tmp_path / "out"
-    assert cli.main(["evaluate", *bags, "--output", str(output), "--duration", "0.4"]) == 1
+    options = ["--output", str(output), "--duration", "0.4", "--table", str(tmp_path / "t.csv")]
+    assert cli.main(["evaluate", *bags, *options]) == 1
     assert "=x: " in capsys.readouterr().out
     rows = json.loads((output / "table.json").read_text())["bags"]
     assert "nothing intact" in rows[0]["problem"]
     assert [row["problem"] for row in rows[1:]] == ["", ""]
-    assert {path.name for path in output.glob("*.html")} == {"pull.html", "pull-2.html"}
-    with (output / "table.csv").open(newline="") as stream:
+    assert {path.name for path in output.glob("*.png")} == {"pull.png", "pull-2.png"}
+    with (tmp_path / "t.csv").open(newline="") as stream:
         assert [row["bag"] for row in csv.DictReader(stream)] == ["'=x", "pull", "pull-2"]
-
-
-def test_a_table_for_duckdb_is_written_and_a_broken_pyarrow_loses_nothing(tmp_path: Path, short_bag: Path, monkeypatch):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    logged: list[str] = []
-    (row,) = evaluate_bags([short_bag], tmp_path / "out", duration=0.4, log=logged.append)
-    assert [each["bag"] for each in parquet.read_table(tmp_path / "out" / "table.parquet").to_pylist()] == [row["bag"]]
-    (tmp_path / "pyarrow.py").write_text("raise ImportError('it is built for another NumPy')")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "pyarrow")
-    evaluate_bags([short_bag], tmp_path / "other", duration=0.4, log=logged.append)
-    assert logged[-1] == "no table.parquet: pyarrow cannot be used: it is built for another NumPy"
-    assert sorted(path.name for path in (tmp_path / "other").iterdir()) == ["pull.html", "table.csv", "table.json"]
 
 
 def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_bag: Path):
@@ -128,7 +126,7 @@ def test_bags_are_found_two_folders_down_each_once(tmp_path: Path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["b"], "--output: got None"),
+        (["b", "--table", "t.xls"], "--table: got 't.xls'"),
         (["b", "--output", "o", "--segments", "9"], "only for reference trajectories"),
         (["r", "--workers", "2"], "only for bags"),
         (["r", "--setup", "x"], "only for bags"),
@@ -149,14 +147,13 @@ def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short
     (row,) = evaluate_bags([bag], tmp_path / "out", duration=0.3, log=said.append)
     assert str(row["bag"]).isprintable()
     assert str(row["path"]).isprintable()
-    assert (tmp_path / "out" / f"{row['bag']}.html").exists()
+    assert (tmp_path / "out" / f"{row['bag']}.png").exists()
 
 
-def test_an_unverified_bag_says_so_in_table_page_and_log(tmp_path: Path, short_bag: Path):
+def test_an_unverified_bag_says_so_in_table_and_log(tmp_path: Path, short_bag: Path):
     copy_with_notes(short_bag, tmp_path / "bag", unverified="salvaged without checksums")
     said: list[str] = []
     (row,) = evaluate_bags([tmp_path / "bag"], tmp_path / "out", duration=0.3, log=said.append)
     assert row["unverified"] == "salvaged without checksums"
-    assert "salvaged without checksums" in (tmp_path / "out" / "table.csv").read_text()
-    assert "Unverified bag:" in (tmp_path / "out" / "bag.html").read_text()
+    assert "salvaged without checksums" in (tmp_path / "out" / "table.json").read_text()
     assert any("unverified: salvaged" in line for line in said)

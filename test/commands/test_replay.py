@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from std_srvs.srv import SetBool
 
+from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import nanoseconds
 from magnetosuture_thread.commands.live import replay_live
 from magnetosuture_thread.commands.render import render_bag
-from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.rig.setups import read_setup

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnetosuture_thread.commands.evaluate import score_rig
+from magnetosuture_thread.evaluation.reference import score_rig
 from magnetosuture_thread.settings.errors import BagError
 
 MATERIAL = {

@@ -36,7 +36,7 @@ def made_metrics(
 
     Estimates are off by half as much, and the thread is disturbed from frame 200 on.
     """
-    metrics = RunMetrics(LENGTH, 10**9, targets, recorded=True)
+    metrics = RunMetrics(LENGTH, 10**9, targets)
     for index in range(frames):
         stamp, off = 10**9 + index * 33_333_333, 1e-6 * index
         seen, truth = NODES + np.array([0.0, off]), NODES + np.array([0.0, 2.0 * off])

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, LoopCollector, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import Percentiles, compare_errors, stage_latencies
+from magnetosuture_thread.evaluation.metrics import Percentiles, SensorSilence, compare_errors, stage_latencies
 from magnetosuture_thread.evaluation.tables import loop_table, summary_table
 from magnetosuture_thread.settings.errors import GraphError
 from test.evaluation.runs import replay_summary
@@ -153,13 +153,22 @@ def test_the_table_says_what_is_simulated_and_fits_a_terminal():
         dropped={"frames not taken by vision_tracker": 3, "poses without an answer": 0},
     )
     text = shown(summary)
-    for words in ("simulated", "90.0 %", "12.0 ms", "no pairs", "0.500 %", "1.000 %", "dropped", "frames not taken"):
+    for words in ("simulated", "9 tracked", "12.0 ms", "no pairs", "0.500 %", "1.000 %", "dropped", "frames not taken"):
         assert words in text
     assert "truth" not in text
     assert "without an answer" not in text
     given: dict[str, Any] = {"refused": {"a pose that is none": 2}, "damage": "the end is missing"}
+    given["silence"] = SensorSilence(1, 3600.0, 3600.0, 0.5)
     text = shown(replace(summary, source="poses", speed=52.4, latency={}, remark="it is another thread", **given))
-    for words in ("recorded poses", "usable", "a pose that is none", "52.4", "the end is missing", "another thread"):
+    for words in (
+        "recorded poses",
+        "usable",
+        "a pose that is none",
+        "52.4",
+        "the end is missing",
+        "another thread",
+        "3600.0 s at",
+    ):
         assert words in text
     for words in ("camera frames", "velocity", "latency", "dropped"):
         assert words not in text
@@ -273,8 +282,11 @@ def test_the_table_ends_with_what_came_of_the_procedure():
     for state, shown, reason in (("done", "succeeded", ""), ("machine too slow", "machine too slow", "73 of 109")):
         outcome = {**met, "state": state, "reason": reason}
         table = loop_table(replace(loop.collector.summary("x"), procedure=outcome))
-        assert [[*column.cells][-1] for column in table.columns[:2]] == ["procedure hernia", shown]
-        assert [*table.columns[2].cells][-1] == "2 of 5 goals met" + f": {reason}" * bool(reason)
+        name, outcome_text = ([*column.cells][-1] for column in table.columns)
+        assert (name, str(outcome_text)) == (
+            "procedure hernia",
+            f"{shown}, 2 of 5 goals met" + f": {reason}" * bool(reason),
+        )
 
 
 def test_a_run_without_a_pose_says_what_the_nodes_said():

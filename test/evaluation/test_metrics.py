@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.evaluation.frames import ErrorMap, FrameResult, Observation, with_gaps
+from magnetosuture_thread.evaluation.frames import ErrorMap, EstimatedThread, FrameResult, Observation, with_gaps
 from magnetosuture_thread.evaluation.metrics import (
     RunMetrics,
     SensorSilence,
@@ -13,7 +13,6 @@ from magnetosuture_thread.evaluation.metrics import (
     prediction_error_percent,
     target_points,
 )
-from magnetosuture_thread.evaluation.page import thinned
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import Prediction
 from test.evaluation.runs import both, margins
@@ -60,25 +59,14 @@ def test_of_a_run_numbers_are_kept_and_the_worst_in_full():
     assert series.column("seen_share") == pytest.approx([1.0, 1.0, 1.0, 0.0])
     assert series.column("strain")[0] == run.maximum("strain") == 0.002
     assert series.times == pytest.approx([0.0, 1.0, 2.0, 3.0])
-    worst = run.worst_measured
-    assert worst is not None
-    assert (worst.stamp, len(worst.vertices)) == (2 * 10**9, 9)
-    assert worst.clearance.tolist() == [*[np.inf] * 7, -0.1, np.inf]
-    assert [each.time for each in run.worst_frames()] == pytest.approx([1.0, 2.0, 0.0])
+    assert run.worst is not None
+    assert (run.worst.time, run.worst.error, run.worst.frame.stamp) == pytest.approx((1.0, 3.0, 2 * 10**9))
+    assert run.worst.frame.clearance.tolist() == [*[np.inf] * 7, -0.1, np.inf]
     assert run.contact_frames == 1
     assert [(m.kind, m.clearance, m.time) for m in run.minimum_margins.values()] == [("obstacle", -0.1, 1.0)]
-    assert run.lost == [[4.0, 43.0]]
+    assert (len(run.observed), run.tracked) == (40, 0)
     assert len(run.reasons) <= 13
     assert run.reasons["others"] > 0
-
-
-def test_worst_frames_are_apart_however_many_there_are():
-    run = RunMetrics(1.0)
-    errors = 1e-3 * np.random.default_rng(0).random(4000)
-    errors[[900, 905, 2500, 3100]] = 0.09, 0.08, 0.07, 0.06
-    for k, error in enumerate(errors):
-        run.add(FrameResult(k * 10**8, vertices=STRAIGHT + np.array([0.0, error]), ground_truth=LINE))
-    assert [each.time for each in run.worst_frames()][:3] == pytest.approx([90.0, 250.0, 310.0])
 
 
 def test_the_error_is_of_the_nodes_that_are_known_and_none_of_less_than_half():
@@ -115,20 +103,6 @@ def test_the_silence_of_a_sensor_is_counted(times: np.ndarray, expected: SensorS
     assert found.at == pytest.approx(expected.at, abs=0.2, nan_ok=True)
 
 
-@pytest.mark.parametrize("count", [5001, 18_000, 123_457])
-def test_no_peak_is_lost_and_no_line_is_longer_than_the_limit(count: int):
-    times = np.arange(count) / 30.0
-    values = np.random.default_rng(count).normal(size=count)
-    values[count // 3], values[-1] = 50.0, -50.0
-    values[7] = np.nan
-    at, columns = thinned(times, {"a": values}, 5000)
-    assert len(at) == len(columns["a"]) <= 5000
-    assert (np.nanmax(columns["a"]), np.nanmin(columns["a"])) == (50.0, -50.0)
-    assert (np.diff(at) >= 0.0).all()
-    peak = at[int(np.nanargmax(columns["a"]))]
-    assert abs(peak - times[count // 3]) <= 2.0 * count / 5000 / 30.0 + 1 / 30.0
-
-
 def test_a_line_is_broken_where_nothing_came():
     times = np.concatenate([np.arange(10) / 30.0, 5.0 + np.arange(10) / 30.0])
     at, values = with_gaps(times, np.ones(20))
@@ -154,3 +128,11 @@ def test_the_map_stays_small_and_keeps_the_greatest_errors(frames: int):
 def test_a_prediction_with_a_node_that_is_nowhere_has_no_error(nodes: np.ndarray):
     curve = np.column_stack([np.linspace(0.0, 0.02, 50), np.zeros(50)])
     assert np.isnan(prediction_error_percent(nodes, curve, 0.02))
+
+
+def test_an_estimate_is_measured_beside_a_prediction_that_is_nowhere():
+    run, nowhere = RunMetrics(1.0), STRAIGHT.copy()
+    nowhere[3] = np.nan
+    run.add(FrameResult(0, vertices=nowhere, ground_truth=LINE, estimate=EstimatedThread(STRAIGHT)))
+    assert not len(run.series.known("error_truth"))
+    assert run.series.known("estimate_error_truth") == pytest.approx([0.0])

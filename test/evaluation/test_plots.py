@@ -1,63 +1,67 @@
-"""The picture of a replayed bag."""
+"""The picture of a run."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
+import io
+import subprocess
+import sys
 
-import cv2
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.evaluation.plots import MARGIN_COLOURS, Photo, draw_summary
+from magnetosuture_thread.evaluation.plots import MARGIN_COLOURS, Photo, draw_metrics
+from magnetosuture_thread.evaluation.replay import picture_or_log
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins
-from test.evaluation.runs import replay_summary
+from test.evaluation.runs import EVIL, LENGTH, NODES, made_metrics
 
-NODES = np.column_stack([0.004 - 0.00076 * np.arange(26), np.zeros(26)])
-
-
-def run(clearance: float) -> RunMetrics:
-    """Return two frames with all nodes at one distance from an obstacle."""
-    metrics, count = RunMetrics(0.019), len(NODES) if np.isfinite(clearance) else 0
-    distances = np.full(count, clearance)
-    nodes, obstacles = np.arange(count, dtype=np.uint32), np.zeros(count, np.int32)
-    margins = Margins((BarrierMargins("obstacle", nodes, obstacles, distances, distances),))
-    for k in (1, 2):
-        seen = NODES + np.array([0.0, 0.0004 * k])
-        frame = FrameResult(k * 10**9, vertices=NODES, strain=1e-6, margins=margins, measured=seen)
-        metrics.add(frame)
-    return metrics
+DISH = np.s_[170:840, 30:700]  # pixels of the dish in the picture
 
 
-def draw(path: Path, view, clearance: float, discs: tuple[Disc, ...] = (), name: str = "bag") -> np.ndarray:
-    """Draw a picture and return its pixels, red, green, blue."""
-    found = run(clearance)
-    chosen = found.worst_measured
-    assert chosen is not None
-    assert chosen.stamp == 2 * 10**9
-    summary = replay_summary(bag=name, frames=2, tracked=2, predicted=2)
-    photo = Photo(np.full((480, 640, 3), 225, np.uint8), view)
-    draw_summary(path, photo, replace(chosen, obstacles=discs), 2.0, summary)
-    image = cv2.imread(str(path))
-    assert image is not None
-    return image[:, :, ::-1]
-
-
-def share(image: np.ndarray, colour: tuple[float, ...]) -> float:
-    """Return the share of the dish's pixels that are near a colour, in 0 to 1."""
-    dish = image[90:600, 60:660].astype(float) / 255.0
-    return float((np.abs(dish - np.asarray(colour[:3])).max(axis=2) < 0.06).mean())
+def pixels(metrics: RunMetrics, photo: Photo | None = None, title: str = "bag") -> np.ndarray:
+    """Draw a picture and return its pixels, red, green, blue, 0 to 1."""
+    return imread(io.BytesIO(draw_metrics(metrics, title, 0.035, photo, "all of it")), format="png")[..., :3]
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.5e-3, 5e-3])
-def test_the_predicted_thread_has_the_colour_of_its_margin(tmp_path: Path, view, clearance: float):
-    obstacles = (Disc((0.0, 0.009), 0.002),)
-    image = draw(
-        tmp_path / "a.png", view, clearance, obstacles, name="a$\\x$b\x1b[31m"
-    )  # neither mathematics nor codes
-    shares = [share(image, MARGIN_COLOURS(c)) for c in (0.0, 0.5, 1.0)]
+def test_the_predicted_thread_has_the_colour_of_its_margin(view, clearance: float):
+    metrics = RunMetrics(LENGTH)
+    distances, nodes = np.full(26, clearance), np.arange(26, dtype=np.uint32)
+    margins = Margins((BarrierMargins("obstacle", nodes, np.zeros(26, np.int32), distances, distances),))
+    for k in (1, 2):
+        seen, discs = NODES + np.array([0.0, 0.0004 * k]), (Disc((0.0, 0.009), 0.002),)
+        metrics.add(FrameResult(k * 10**9, vertices=NODES, margins=margins, measured=seen, obstacles=discs))
+    # Of a name neither mathematics nor codes are drawn.
+    dish = pixels(metrics, Photo(np.full((480, 640, 3), 225, np.uint8), view), "a$\\x$b\x1b[31m")[DISH]
+    shares = [(np.abs(dish - MARGIN_COLOURS(c)[:3]).max(axis=2) < 0.06).mean() for c in (0.0, 0.5, 1.0)]
     assert int(np.argmax(shares)) == {0.0: 0, 0.5e-3: 1, 5e-3: 2}[clearance]
     assert max(shares) > 5e-4
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_a_run_without_a_camera_is_drawn_on_a_plan(estimated: bool):
+    metrics = made_metrics(estimated=estimated)
+    picture = pixels(metrics, title=EVIL)
+    assert np.median(picture[DISH]) == pytest.approx(244 / 255, abs=0.01)
+    assert metrics.worst is not None
+    assert metrics.worst.time == pytest.approx(299 / 30)
+    nothing = RunMetrics(LENGTH)
+    nothing.add(FrameResult(0, vertices=NODES))
+    assert pixels(nothing).shape == picture.shape
+
+
+def test_a_picture_that_fails_is_a_line_in_the_log():
+    lines: list[str] = []
+    assert picture_or_log(lambda: b"picture", lines.append) == b"picture"
+    assert picture_or_log(lambda: draw_metrics(RunMetrics(LENGTH), "bag", 0.035), lines.append) == b""
+    assert [line.partition(":")[0] for line in lines] == ["no picture"]
+
+
+def test_a_command_draws_whatever_backend_a_notebook_asks_for(tmp_path):
+    code = "from magnetosuture_thread import cli; cli.main(['scene', 'draw', 'dish_35mm', '--output', 'dish.png'])"
+    environment = {"MPLBACKEND": "module://there_is.none", "HOME": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=tmp_path, env=environment)
+    assert (tmp_path / "dish.png").read_bytes().startswith(b"\x89PNG")

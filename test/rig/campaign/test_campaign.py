@@ -103,7 +103,7 @@ def test_the_files_of_each_seed_do_not_depend_on_the_number_of_processes(
     named = {"reason", "time_s", "ideal_time_s", "min_needle_clearance_m", "longest_rest_s", "wrap_degrees"}
     assert named <= set(content["runs"][0])
     assert main([*common, "--output", str(tmp_path / "1")]) == 1  # exists already
-    for name in ("campaign.json", "campaign.html", "bags/seed_4/seed_4_0.mcap"):
+    for name in ("campaign.json", "campaign.csv", "campaign.png", "bags/seed_4/seed_4_0.mcap"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
     bag = Bag(tmp_path / "1" / "bags" / "seed_4")
     assert bag.notes["simulated"].endswith("seed 4")

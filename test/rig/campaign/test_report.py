@@ -1,15 +1,16 @@
-"""The page of a campaign: pictures of failed runs, reasons, charts, and nothing loaded or run."""
+"""The picture of a campaign, and why a run fails."""
 
 from __future__ import annotations
 
-import re
+import io
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
-from magnetosuture_thread.commands.campaign import CampaignResult, write_page
+from magnetosuture_thread.commands.campaign import CampaignResult, draw_campaign
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.campaign import RunFigures, RunInstant, RunResult
@@ -33,36 +34,18 @@ def failed(seed: int, figures: RunFigures, reason: str, closest: RunInstant) -> 
     return RunResult(seed, False, reason, False, 2, figures, 82.0, instants, closest)
 
 
-def page_of(*runs: RunResult) -> str:
-    """Return the page of a campaign of the hernia repair."""
-    bags = {3: "bags/seed_3"}
-    return write_page(CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, list(runs), {}, bags))
-
-
-def test_each_failed_run_has_a_strip_of_its_last_seconds_and_of_its_closest_instant():
-    close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "too <close>", instant(20.0, 0.0002, "wall"))
-    slow = failed(4, replace(GOOD, time_s=200.0), "too slow", instant(20.0, 0.0003))
-    page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0), close, slow)
-    assert re.findall(r'<article [^>]*id="([^"]+)"', page) == ["seed-3", "seed-4"]
-    strips = page.split('<article class="run"')[1:]
-    # The dish, six instants of the last seconds, in one of which the closest instant stands where it came earlier.
-    assert [strip.count("<figure") for strip in strips] == [7, 7]
-    times = [re.findall(r"<figcaption><b>([0-9.]+) s</b>", strip) for strip in strips]
-    assert times[0] == ["80.00", "20.00", "76.80", "77.60", "78.40", "79.20", "80.00"]
-    assert times[1] == ["80.00", "76.00", "76.80", "77.60", "78.40", "79.20", "80.00"]
-    assert "at rest: wall" in strips[0]
-    assert "too &lt;close&gt;" in page
-    assert 'points="1.000,2.000 3.500,2.000"' in page  # the needle, in mm
-
-
-def test_reasons_tiles_and_limits_follow_from_the_figures():
-    close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "", instant(79.0, 0.0002))
-    page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0), close)
-    assert re.search(r"came too close to wall or shape</th><td>1 of 2</td>", page)
-    assert re.search(r"not all goals reached</th><td>1 of 2</td>", page)
-    assert page.count(">1 of 2</span>") == 2  # tiles: succeeded, reached all goals
-    assert re.findall(r'class="beyond">([^<]+)<', page) == ["0.200 mm"]
-    assert '<td class="words">bags/seed_3</td>' in page
+@pytest.mark.parametrize("failures", [0, 1, 14])
+def test_a_campaign_is_drawn_with_the_dish_of_each_failed_run(failures: int):
+    close = replace(GOOD, min_needle_clearance_m=0.0002)
+    runs = [RunResult(0, True, "", True, 5, GOOD, 81.0)]
+    runs += [failed(seed, close, "too <close>", instant(20.0, 0.0002)) for seed in range(1, failures + 1)]
+    result = CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, runs)
+    picture = imread(io.BytesIO(draw_campaign(result)), format="png")[..., :3]
+    rows = min(-(-failures // 4), 3)
+    assert picture.shape[0] == pytest.approx(110 * (3.3 + 3.6 * rows), abs=1)
+    liquid = np.abs(picture - np.array([0xF4, 0xF1, 0xEC]) / 255).max(axis=2) < 0.01
+    assert bool(liquid[400:].sum() > 1e4) == bool(failures)
+    assert (np.abs(picture - np.array([0xC8, 0x10, 0x2E]) / 255).max(axis=2) < 0.05).any() == bool(failures)
 
 
 @pytest.mark.parametrize(
@@ -81,11 +64,3 @@ def test_a_figure_beyond_its_limit_is_named_with_what_is_allowed(name: str, chan
     found = replace(GOOD, **change).beyond_limits(0.0003)
     assert found.keys() == {name}
     assert words in found[name]
-
-
-def test_the_page_loads_and_runs_nothing():
-    page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0))
-    assert not re.search(r"<(script|img|link|iframe|object)", page)
-    assert all(link.startswith("#") for link in re.findall(r'(?:href|src)="([^"]*)"', page))
-    assert "default-src 'none'" in page
-    assert "Simulated:" in page

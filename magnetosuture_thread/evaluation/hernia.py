@@ -6,45 +6,39 @@ it, the figures of such a run, and its pictures: six instants, the barriers over
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.table import Table
+from PIL import Image
 
-from magnetosuture_thread import (
-    FilteredCommand,
-    InvalidInputError,
-    Margins,
-    NeedlePose,
-    NeedleSafetyFilter,
-    Prediction,
-    Scene,
-    SolverError,
-    Workspace,
-)
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import seconds
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.coils.filter import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import ThreadSession
-from magnetosuture_thread.evaluation.plots import FAINT, INK, KIND_COLOURS, draw_empty_dish, shape_patch, tidy
+from magnetosuture_thread.evaluation.plots import FAINT, INK, draw_arrow, draw_shapes, make_figure, tidy, to_png
+from magnetosuture_thread.evaluation.replay import picture_or_log
 from magnetosuture_thread.evaluation.workers import Log, Progress
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.rig.setups import Setup, read_setup
-from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.errors import BagError, InvalidInputError, SolverError
 from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.interface import OPERATOR_COMMAND
-from magnetosuture_thread.thread.margins import FrictionState, friction_colour
+from magnetosuture_thread.thread.margins import FrictionState, Margins, friction_colour
+from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 
 RATE = 33.0  # Hz, of the paper's simulation
 COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge
@@ -324,10 +318,9 @@ def replay_hernia(
         run = replay_steering(settings, start_centreline(setup), steering, needle, progress)
         figures = run.figures(setup.name)
         (folder / "hernia.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        draw_hernia(folder / "hernia.png", run)
-        if animation:
-            log("drawing the animation")
-            draw_animation(folder / "hernia.gif", run)
+        for name, draw in {"hernia.png": draw_hernia, **({"hernia.gif": draw_animation} if animation else {})}.items():
+            if picture := picture_or_log(partial(draw, run), log):
+                (folder / name).write_bytes(picture)
     return figures
 
 
@@ -358,32 +351,9 @@ def start_centreline(setup: Setup) -> np.ndarray:
     return setup.rig.thread_at_start(np.linspace(0.0, 1.0, 200))
 
 
-def hernia_table(figures: dict[str, Any]) -> Table:
-    """Return a row for each instant that is shown."""
-    table = Table(title=f"{figures['setup']}, simulated: {figures['simulated']}")
-    for name in ("time [s]", "thread", "nodes", "slowdown", "asked [mm/s]", "passed [mm/s]"):
-        table.add_column(name, justify="left" if name == "thread" else "right", no_wrap=True)
-    for instant in figures["instants"]:
-        speeds = (f"{1e3 * math.hypot(*instant[name]):.2f}" for name in ("asked", "passed"))
-        nodes, slowdown = str(len(instant["friction_nodes"])), f"{instant['slowdown']:.2f}"
-        table.add_row(f"{instant['time']:.1f}", instant["state"], nodes, slowdown, *speeds)
-    return table
-
-
-def hernia_lines(figures: dict[str, Any]) -> list[str]:
-    """Return in words what the table does not say."""
-    return [
-        "{duration:.1f} s at {rate:g} Hz, {nodes} segments, formulation {formulation}".format(**figures),
-        f"deepest node in an obstacle {figures['deepest']:.1e} m, middle of a chord "
-        f"{1e6 * figures['chord_deepest']:.0f} µm, maximum stretch {100.0 * figures['stretch']:.4f} %",
-        f"a step takes {1e3 * figures['median_step']:.2f} ms (99th percentile {1e3 * figures['high_step']:.2f}): "
-        f"{figures['room']:.0f} times faster than its period",
-    ]
-
-
-def draw_hernia(path: Path, run: HerniaRun) -> None:
-    """Draw six instants, the barriers of the first nodes and friction over time, and write the picture as PNG."""
-    figure = Figure(figsize=(13.2, 13.2), dpi=100, facecolor="white")
+def draw_hernia(run: HerniaRun) -> bytes:
+    """Return a picture of six instants, and of the barriers of the first nodes and the friction over time, as PNG."""
+    figure = make_figure(13.2, 13.2, 100.0)
     figure.text(0.03, 0.975, "A needle steered by hand around a hernia, simulated", fontsize=14, color=INK)
     words = (
         "the thread model alone, the needle a point; solid arrow: where the needle goes, dotted: what was asked of it\n"
@@ -415,45 +385,38 @@ def draw_hernia(path: Path, run: HerniaRun) -> None:
             axes.axvline(instant.time, color=FAINT, linewidth=0.7, linestyle=(0, (1, 3)), zorder=0)
         axes.set_xlim(0.0, at[-1])
         tidy(axes)
-    figure.savefig(path)
+    return to_png(figure)
 
 
-def draw_animation(path: Path, run: HerniaRun) -> None:
-    """Draw the run, faster than it happened, and write it as GIF."""
+def draw_animation(run: HerniaRun) -> bytes:
+    """Return the run, faster than it happened, as GIF."""
     faster, rate = 6, 8  # than it happened; pictures a second
-    figure = Figure(figsize=(4.6, 5.0), dpi=96, facecolor="white")
-    writer = PillowWriter(fps=rate)
-    with writer.saving(figure, str(path), 96):
-        for k in range(math.floor(run.instants[-1].time / faster * rate) + 1):
-            instant = run.nearest(k * faster / rate)
-            figure.clear()
-            draw_instant(figure.add_axes((0.0, 0.0, 1.0, 0.9)), run.scene, instant)
-            figure.text(0.03, 0.955, caption(instant), fontsize=10.5, color=INK)
-            words = f"{instant.time:.0f} s, shown {faster} times as fast; simulated, the thread model alone"
-            figure.text(0.03, 0.915, words, fontsize=8, color=FAINT)
-            writer.grab_frame()
+    pictures = []
+    for k in range(math.floor(run.instants[-1].time / faster * rate) + 1):
+        figure, instant = make_figure(4.6, 5.0, 96.0), run.nearest(k * faster / rate)
+        draw_instant(figure.add_axes((0.0, 0.0, 1.0, 0.9)), run.scene, instant)
+        figure.text(0.03, 0.955, caption(instant), fontsize=10.5, color=INK)
+        words = f"{instant.time:.0f} s, shown {faster} times as fast; simulated, the thread model alone"
+        figure.text(0.03, 0.915, words, fontsize=8, color=FAINT)
+        pictures.append(Image.open(io.BytesIO(to_png(figure))).convert("RGB"))
+    stream = io.BytesIO()
+    pictures[0].save(stream, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // rate, loop=0)
+    return stream.getvalue()
 
 
 def draw_instant(axes: Axes, scene: Scene, instant: SteeredInstant) -> None:
     """Draw the dish, the thread in the colour of its friction, and the needle with its commanded velocity, in mm."""
-    draw_empty_dish(axes, scene, 0.08)
-    for shape in scene.shapes:
-        face, edge = KIND_COLOURS[shape.kind]
-        axes.add_patch(shape_patch(shape.geometry, facecolor=face, edgecolor=edge, linewidth=0.9))
+    draw_shapes(axes, scene)
     points, friction = 1e3 * instant.prediction.positions, instant.margins.friction
     colour = friction_colour(friction)
     axes.plot(*points.T, color="white", linewidth=4.0, solid_capstyle="round", alpha=0.8)
     axes.plot(*points.T, color=colour, linewidth=2.0, marker="o", markersize=2.4, markeredgewidth=0.0)
     under = points[list(friction.nodes)]
     axes.plot(*under.T, "o", color=colour, markersize=4.6, markeredgecolor="white", markeredgewidth=0.7)
-    x, y = points[0]
     if instant.command is not None:
         for velocity, style in ((instant.command.commanded, (0, (1.5, 1.2))), (instant.command.filtered, "solid")):
-            if velocity.any():
-                ahead = points[0] + 1.2e3 * velocity  # the way of 1.2 s
-                arrow = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "linestyle": style}
-                axes.annotate("", xy=tuple(ahead), xytext=(x, y), arrowprops=arrow)
-    axes.plot([x], [y], "o", color=INK, markersize=5.0, markeredgecolor="white", markeredgewidth=0.8)
+            draw_arrow(axes, points[0], 1.2e3 * velocity, style)  # the way of 1.2 s
+    axes.plot(*points[0], "o", color=INK, markersize=5.0, markeredgecolor="white", markeredgewidth=0.8)
 
 
 def caption(instant: SteeredInstant) -> str:

@@ -11,7 +11,8 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.commands.reproduce_hernia import (
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.evaluation.hernia import (
     PAPER_SEGMENTS,
     HerniaRun,
     RecordedCommands,
@@ -25,7 +26,6 @@ from magnetosuture_thread.commands.reproduce_hernia import (
     replay_steering,
     start_centreline,
 )
-from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.rig.setups import read_setup
@@ -66,13 +66,13 @@ def test_a_needle_goes_where_it_is_told_and_slower_under_friction(through: Herni
 
 
 def test_picture_and_animation_show_the_run(through: HerniaRun, tmp_path: Path):
-    draw_hernia(tmp_path / "hernia.png", through)
+    (tmp_path / "hernia.png").write_bytes(draw_hernia(through))
     picture = cv2.imread(str(tmp_path / "hernia.png"))
     assert picture is not None
     assert min(picture.shape[:2]) > 1000
     for blue, green, red in ((84, 158, 31), (80, 166, 240)):  # a free thread, and one under friction, in BGR
         assert (np.abs(picture.astype(int) - (blue, green, red)).max(axis=2) < 40).sum() > 50
-    draw_animation(tmp_path / "hernia.gif", through)
+    (tmp_path / "hernia.gif").write_bytes(draw_animation(through))
     frames = cv2.VideoCapture(str(tmp_path / "hernia.gif"))
     first, second = frames.read(), frames.read()
     assert first[0]
