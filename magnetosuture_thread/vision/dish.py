@@ -118,12 +118,6 @@ class _Edges:
         return at, np.abs(along) > ALIGNMENT * np.hypot(*normal.T)
 
 
-def find_ellipse(image: np.ndarray) -> Ellipse | None:
-    """Return the inner edge of a dish's wall, by gradients alone; None if no edges agree on one. See `find_rings`."""
-    rings = find_rings(image)
-    return inner_ring(rings) if rings else None
-
-
 @dataclass(frozen=True)
 class Ring:
     """An edge of a dish's wall or lid: its ellipse [px], and the share of the directions in which it is seen."""
@@ -710,10 +704,6 @@ class DishWatch:
         """Standard deviation of the view's scale, as a share; see `FoundDish`."""
         return self.found.scale_error if self.found is not None else 0.0
 
-    def forget(self) -> None:
-        """Begin anew, as with a camera of another size."""
-        self.found, self._anew, self._searched = None, [], 0
-
     def look(self, image: np.ndarray) -> tuple[str, np.ndarray]:
         """Look at the rim in a frame.
 
@@ -953,7 +943,7 @@ def fit_circle(points: Points, agreement: float) -> Circle | None:
         xx, xy, yy, xs, ys = x @ x, x @ y, y @ y, x @ squares, y @ squares
         determinant = 2.0 * max(xx * yy - xy * xy, 1e-9)
         u, v = (yy * xs - xy * ys) / determinant, (xx * ys - xy * xs) / determinant
-        radius, centre = math.sqrt(float(squares.mean()) + u * u + v * v), mean + (u, v)
+        radius, centre = math.sqrt(float(squares.mean()) + u * u + v * v), mean + np.array([u, v])
         kept = points[np.abs(np.hypot(*(points - centre).T) - radius) < tolerance]
     return float(centre[0]), float(centre[1]), radius, len(kept)
 

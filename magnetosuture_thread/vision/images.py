@@ -16,7 +16,7 @@ import io
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,47 +44,27 @@ FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not
 Gray = NDArray[np.uint8]
 
 
-class Encoding(NamedTuple):
-    """How the pixels of a raw image lie in memory.
-
-    Attributes:
-        bits: of a value.
-        values: in a row, for each pixel.
-        conversion: OpenCV's to BGR; None for pixels that are grey or BGR.
-        block: side of the square of pixels that share their colour.
-    """
-
-    bits: int
-    values: int
-    conversion: int | None = None
-    block: int = 1
-
-
-# By the names of sensor_msgs/image_encodings, and nv12 as drivers name it.
-ENCODINGS = {
-    name: Encoding(8, values, code, block=2)
-    for names, values, code in (
-        (("yuv422", "uyvy"), 2, cv2.COLOR_YUV2BGR_UYVY),
-        (("yuv422_yuy2", "yuyv"), 2, cv2.COLOR_YUV2BGR_YUYV),
-        (("nv12",), 1, cv2.COLOR_YUV2BGR_NV12),
-        (("nv21",), 1, cv2.COLOR_YUV2BGR_NV21),
-    )
-    for name in names
+# Values a pixel and OpenCV's conversion to BGR, None of grey and BGR, by the names of sensor_msgs/image_encodings, and
+# nv12 as drivers name it.
+ENCODINGS: dict[str, tuple[int, int | None]] = {
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2BGR_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2BGR_YUYV)),
+    "nv12": (1, cv2.COLOR_YUV2BGR_NV12),
+    "nv21": (1, cv2.COLOR_YUV2BGR_NV21),
 }
 for _bits in (8, 16):
-    for _names, _values, _conversion in (
-        (("mono{}", "{}UC1"), 1, None),
-        (("bgr{}", "{}UC3"), 3, None),
-        (("rgb{}",), 3, cv2.COLOR_RGB2BGR),
-        (("bgra{}", "{}UC4"), 4, cv2.COLOR_BGRA2BGR),
-        (("rgba{}",), 4, cv2.COLOR_RGBA2BGR),
+    ENCODINGS |= {
+        **dict.fromkeys((f"mono{_bits}", f"{_bits}UC1"), (1, None)),
+        **dict.fromkeys((f"bgr{_bits}", f"{_bits}UC3"), (3, None)),
+        **dict.fromkeys((f"bgra{_bits}", f"{_bits}UC4"), (4, cv2.COLOR_BGRA2BGR)),
+        f"rgb{_bits}": (3, cv2.COLOR_RGB2BGR),
+        f"rgba{_bits}": (4, cv2.COLOR_RGBA2BGR),
         # OpenCV names a pattern by the second and third pixel of its second row.
-        (("bayer_rggb{}",), 1, cv2.COLOR_BayerBG2BGR),
-        (("bayer_bggr{}",), 1, cv2.COLOR_BayerRG2BGR),
-        (("bayer_gbrg{}",), 1, cv2.COLOR_BayerGR2BGR),
-        (("bayer_grbg{}",), 1, cv2.COLOR_BayerGB2BGR),
-    ):
-        ENCODINGS |= {name.format(_bits): Encoding(_bits, _values, _conversion) for name in _names}
+        f"bayer_rggb{_bits}": (1, cv2.COLOR_BayerBG2BGR),
+        f"bayer_bggr{_bits}": (1, cv2.COLOR_BayerRG2BGR),
+        f"bayer_gbrg{_bits}": (1, cv2.COLOR_BayerGR2BGR),
+        f"bayer_grbg{_bits}": (1, cv2.COLOR_BayerGB2BGR),
+    }
 
 
 @dataclass(frozen=True)
@@ -405,23 +385,24 @@ def unpack_image(
     Raises:
         InvalidInputError: the encoding is another, or the sizes don't fit the data.
     """
-    if (form := ENCODINGS.get(encoding)) is None:
+    if encoding not in ENCODINGS:
         expected = "one that OpenCV converts to BGR, as bgr8, mono16, bayer_rggb8, yuv422 or nv12"
         raise InvalidInputError("image.encoding", repr(encoding), expected)
-    buffer, length = np.frombuffer(data, dtype=np.uint8), width * form.values * form.bits // 8
-    planar = form.block == 2 and form.values == 1
+    (values, conversion), is_wide = ENCODINGS[encoding], "16" in encoding
+    pixel, planar = values * (1 + is_wide), encoding.startswith("nv")
+    buffer = np.frombuffer(data, dtype=np.uint8)
     rows = height * 3 // 2 if planar else height
-    whole = width % form.block == 0 and not (planar and height % 2)
-    if height < 1 or width < 1 or step < length or buffer.size != rows * step or not whole:
+    whole = not (planar and height % 2) and not ((planar or values == 2) and width % 2)  # colours of two pixels
+    if height < 1 or width < 1 or step < width * pixel or buffer.size != rows * step or not whole:
         sizes = f"{buffer.size} bytes for {width} x {height}, step {step}"
-        expected = f"{rows} rows of step bytes, {form.values * form.bits // 8} for each of {width} pixels"
+        expected = f"{rows} rows of step bytes, {pixel} for each of {width} pixels"
         raise InvalidInputError("image.step", sizes, expected)
-    pixels = buffer.reshape(rows, step)[:, :length]
-    if form.bits == 16:
+    pixels = buffer.reshape(rows, step)[:, : width * pixel]
+    if is_wide:
         pixels = np.ascontiguousarray(pixels).view(">u2" if big_endian else "<u2").astype(np.uint16, copy=False)
-    if form.values > 1:
-        pixels = pixels.reshape(height, width, form.values)
-    return eight_bits(pixels if form.conversion is None else np.asarray(cv2.cvtColor(pixels, form.conversion)))
+    if values > 1:
+        pixels = pixels.reshape(height, width, values)
+    return eight_bits(pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion)))
 
 
 def check_image(image: np.ndarray) -> None:

@@ -531,30 +531,10 @@ def _shift_of(along, dark, depth):
     ends, near = np.empty(lines), np.empty(lines)
     shift = 0.0
     for _ in range(2):  # The second time by levels around the end that the first one found.
-        inside, outside, middle, square = 0, 0, 0.0, 0.0
-        for row in range(len(along)):
-            inside += shift + LEVEL_PX < along[row] < shift + 2.0 * LEVEL_PX
-            if shift - REACH_PX < along[row] < shift - LEVEL_PX:
-                outside += 1
-                middle += along[row]
-        middle /= outside
-        for row in range(len(along)):
-            if shift - REACH_PX < along[row] < shift - LEVEL_PX:
-                square += (along[row] - middle) ** 2
         rising, thread = 0, np.inf
         for line in range(lines):
-            body, mean, slope = 0.0, 0.0, 0.0
-            ends[line], near[line] = np.nan, -np.inf
-            for row in range(len(along)):
-                s, value = along[row], dark[row, line]
-                if shift + LEVEL_PX < s < shift + 2.0 * LEVEL_PX:
-                    body += value / inside
-                if shift - REACH_PX < s < shift - LEVEL_PX:
-                    mean += value / outside
-                    slope += (s - middle) * value / square
-                if shift - REACH_PX < s < shift - 1.25:  # px; a thread is told from the end itself
-                    near[line] = max(near[line], value)
-            behind = mean + slope * (shift - middle)
+            body, behind, near[line] = _levels(along, dark, line, shift)
+            ends[line] = np.nan
             if body - behind > 0.3 * depth:  # of the darkness of steel
                 rising += 1
                 thread = min(thread, near[line])
@@ -565,23 +545,37 @@ def _shift_of(along, dark, depth):
             return np.nan
         total, place, spread = 0.0, 0.0, 0.0
         for line in range(lines):
+            near[line] = 1.0 / (1.0 + ((near[line] - thread) / (0.02 * depth)) ** 2)  # the line's weight
             if not math.isnan(ends[line]):
-                weight = _weight(near[line] - thread, depth)
-                total += weight
-                place += weight * ends[line]
+                total += near[line]
+                place += near[line] * ends[line]
         shift = place / total
         for line in range(lines):
             if not math.isnan(ends[line]):
-                spread += _weight(near[line] - thread, depth) * abs(ends[line] - shift) / total
+                spread += near[line] * abs(ends[line] - shift) / total
         if not abs(shift) < MAX_SHIFT_PX or spread > 0.5:
             return np.nan
     return shift
 
 
-@compiled_inline
-def _weight(darker, depth):
-    """Return the weight of a line that is darker behind the end than the least dark one."""
-    return 1.0 / (1.0 + (darker / (0.02 * depth)) ** 2)  # at 0.02 of the darkness of steel half
+@compiled_inner
+def _levels(along, dark, line, shift):
+    """Return the mean darkness within the needle, that of the floor behind it at its end, and the greatest behind it."""
+    inside, outside, body, near = 0, 0, 0.0, -np.inf
+    places, squares, levels, products = 0.0, 0.0, 0.0, 0.0
+    for row in range(len(along)):
+        s, value = along[row] - shift, dark[row, line]
+        if LEVEL_PX < s < 2.0 * LEVEL_PX:
+            inside += 1
+            body += value
+        if -REACH_PX < s < -LEVEL_PX:  # where a line is fitted to the floor
+            outside += 1
+            places, squares = places + s, squares + s * s
+            levels, products = levels + value, products + s * value
+        if -REACH_PX < s < -1.25:  # px; a thread is told from the end itself
+            near = max(near, value)
+    slope = (outside * products - places * levels) / (outside * squares - places * places)
+    return body / inside, (levels - slope * places) / outside, near
 
 
 @compiled_inner

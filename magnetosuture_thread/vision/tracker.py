@@ -39,7 +39,6 @@ from magnetosuture_thread.vision.observe import observe
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.walk import Ridge, smoothed, walk_on, worth
 
-MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 UNDIRECTED = "the needle's axis is found, but not which end is the tip: click it on the page, or by --tip or needle/tip"
@@ -369,14 +368,10 @@ class VisionTracker:
         chosen = within[0] if len(within) == 1 else self._with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
-            if chosen is None:
-                return (
-                    None,
-                    None,
-                    True,
-                    f"{len(needles)} needles in the dish: point at the tip of one, or limit region_px",
-                )
-            return chosen, picture, True, ""
+            if chosen is not None:
+                return chosen, picture, True, ""
+            remedy = "point at the tip of one, or limit region_px"
+            return None, None, True, f"{len(needles)} needles in the dish: {remedy}"
         pose = _pose(chosen, picture, time)
         if self._fits(pose, last):
             self._take(pose, last)
@@ -436,8 +431,8 @@ class VisionTracker:
         """
         if not needle.heading_known:
             return needle.tail_px[None]
-        max_length = MAX_LENGTH_RATIO * self._settings.thread_length / picture.view.metres_per_pixel
-        return find_centreline(picture, gray, needle, max_length)
+        length = self._settings.thread_length / picture.view.metres_per_pixel
+        return find_centreline(picture, gray, needle, 1.05 * length)  # beyond which a walk is of something else
 
     def _pose_of(self, needle: MeasuredNeedle, view: DishView) -> Track:
         """Return what a needle tells, without the thread.
