@@ -170,7 +170,7 @@ def _integrals(picture: Picture, points: Points, half: float) -> Values:
         points: of a polyline, shape (m, 2) [px].
         half: distance up to which is integrated [px].
     """
-    aside, tangents = STEP_PX * np.arange(int(2.0 * half / STEP_PX + 1e-9) + 1) - half, tangents_of(points)
+    aside, tangents = np.arange(-half, half + 1e-9, STEP_PX), tangents_of(points)
     layers = (picture.darkest, picture.brightest)
     light = np.stack([profiles(layer.pixels, points, aside, tangents) for layer in layers])
     ground = np.maximum(light[..., [0, 1, -2, -1]].mean(axis=-1, keepdims=True), 1.0)

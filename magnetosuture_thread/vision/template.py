@@ -560,7 +560,7 @@ def _shift_of(along, dark, depth):
 
 @compiled_inner
 def _levels(along, dark, line, shift):
-    """Return the mean darkness within the needle, that of the floor behind it at its end, and the greatest behind it."""
+    """Return the mean darkness within the needle, that of the floor at its end, and the greatest behind it."""
     inside, outside, body, near = 0, 0, 0.0, -np.inf
     places, squares, levels, products = 0.0, 0.0, 0.0, 0.0
     for row in range(len(along)):

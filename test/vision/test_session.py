@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.vision import tracker
+from magnetosuture_thread.vision.observe import observe
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import (
     REPEATED,
@@ -27,13 +27,13 @@ TAIL = np.array([0.002, 0.001])
 @pytest.fixture
 def searches(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Return a list that grows with each measurement of a thread, by whether all of the frame is searched."""
-    searches, measure = list[bool](), tracker.observe
+    searches = list[bool]()
 
-    def observe(*args: Any, **options: Any) -> ThreadObservation:
+    def measure(*args: Any, **options: Any) -> ThreadObservation:
         searches.append(options["search"])
-        return measure(*args, **options)
+        return observe(*args, **options)
 
-    monkeypatch.setattr(tracker, "observe", observe)
+    monkeypatch.setattr("magnetosuture_thread.vision.tracker.observe", measure)
     return searches
 
 
