@@ -85,7 +85,7 @@ def frames(camera, thread_arc) -> list[np.ndarray]:
 
 
 def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
-    said = []
+    said = list[tuple[list[PredictedThread], list[SafetyMargins]]]()
     for alone in (False, True):
         with reserved_domain() as domain, own_context(domain) as context:
             graph = Graph(context, domain)
