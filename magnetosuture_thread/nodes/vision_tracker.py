@@ -128,7 +128,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         session.set_lens(None if interface.is_rectified(self._camera) else self._lens)
 
     def on_image(self, message: Image | CompressedImage) -> None:
-        """Track the needle in a frame."""
+        """Track the needle in a frame; its pose is published before the thread is measured."""
         self._last_frame = time.monotonic()
         stamp, taken = message.header.stamp, 0.0
         try:
@@ -146,17 +146,19 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             seen = self._session.on_broken(error)
         else:
             began = time.perf_counter()
-            seen = self._session.on_image(reading.seconds(stamp), image)
+            seen = self._session.on_image(reading.seconds(stamp), image, lambda pose: self._publish_pose(stamp, pose))
             taken = time.perf_counter() - began
         track = seen.track
         if seen.tracked:
             self._publish(thread_outputs(stamp, track.observation, seen.centreline))
-        if len(track.tail):  # also with a heading that is unknown, which those who need it refuse
-            self._publish(pose_outputs(stamp, track.tail, track.heading, track.covariance))
         if seen.tracked and self.follower is not None:
             self.follower(stamp, track)
         self._states.publish(packed_tracker_state(stamp, track, 0.0 if seen.problem else taken))
         self._report(seen, self._session)
+
+    def _publish_pose(self, stamp: Time, pose: Track) -> None:
+        """Publish a pose, also with a heading that is unknown, which those who need it refuse."""
+        self._publish(pose_outputs(stamp, pose.tail, pose.heading, pose.covariance))
 
     def _report(self, seen: FrameMeasurement, session: TrackerSession) -> None:
         """Report what was seen in a frame."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.vision.arc import MeasuredNeedle
-from magnetosuture_thread.vision.images import Gray, Picture, Wall, glare_mask, middle, runs, sampled
+from magnetosuture_thread.vision.images import Gray, Picture, Wall, glare_mask, median, middle, runs, sample_across
 
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
 BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
@@ -109,11 +109,18 @@ def tangents_of(points: Points) -> Points:
     return np.asarray(along / np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None])
 
 
-def across(points: Points, aside: Values) -> Points:
-    """Return points at distances aside of the vertices of a polyline, shape (m, n, 2)."""
-    along = tangents_of(points)
-    normals = np.column_stack([-along[:, 1], along[:, 0]])
-    return np.asarray(points[:, None] + aside[None, :, None] * normals[:, None])
+def profiles(gray: Gray, points: Points, aside: Values, tangents: Points | None = None) -> Values:
+    """Return an image at distances aside of the vertices of a polyline, shape (m, n).
+
+    Args:
+        gray: shape (rows, columns), uint8.
+        points: the vertices, shape (m, 2) [px].
+        aside: from u towards v, shape (n,) [px].
+        tangents: of the polyline at them; None to take them from the vertices.
+    """
+    values = np.empty((len(points), len(aside)))
+    sample_across(gray, points, tangents_of(points) if tangents is None else tangents, aside, values)
+    return values
 
 
 def respaced(points: Points, spacing: float) -> Points:
@@ -133,10 +140,11 @@ def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) 
     """
     shown = np.flatnonzero(visible) if visible.sum() >= 8 else np.arange(len(points))
     shown = shown[:: max(1, len(shown) // 32)]
+    tangents, points = tangents_of(points)[shown], points[shown]
     aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-    profiles = sampled(gray, across(points, aside)[shown])
-    floors = np.median(profiles[:, np.abs(aside) > 0.5 * REACH_PX], axis=1)
-    usual = -np.median(profiles - floors[:, None], axis=0)
+    values = profiles(gray, points, aside, tangents)
+    floors = median(values[:, np.abs(aside) > 0.5 * REACH_PX])
+    usual = -median(values - floors[:, None], axis=0)
     centre = len(aside) // 2
     peak = centre - 2 + int(np.argmax(usual[centre - 2 : centre + 3]))
     left = right = peak
@@ -147,10 +155,10 @@ def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) 
     width = STEP_PX * (right - left + 1)
     floor = aside[:: round(1.0 / STEP_PX)]
     floor = floor[np.abs(floor) > 0.5 * width + 3.0]
-    raw = np.rint(sampled(picture.darkest.pixels, across(points, floor)[shown]))  # Between pixels there is less noise.
+    raw = np.rint(profiles(picture.darkest.pixels, points, floor, tangents))  # Between pixels there is less noise.
     noise = 1.4826 * middle(np.abs(np.diff(raw, axis=1))) / math.sqrt(2.0)
     half = 0.5 * width + BESIDE_PX
-    darkness = np.array([np.median(each) for each in _integrals(picture, points[shown], half)])
+    darkness = median(_integrals(picture, points, half))
     return Appearance(width, darkness, max(float(usual[peak]), FAINTEST), max(noise, 0.5))
 
 
@@ -162,37 +170,34 @@ def _integrals(picture: Picture, points: Points, half: float) -> Values:
         points: of a polyline, shape (m, 2) [px].
         half: distance up to which is integrated [px].
     """
-    at = across(points, np.asarray(STEP_PX * np.arange(int(2.0 * half / STEP_PX + 1e-9) + 1) - half, np.float64))
-    profiles = np.stack([sampled(layer.pixels, at) for layer in (picture.darkest, picture.brightest)])
-    ground = np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1, keepdims=True), 1.0)
-    return np.asarray(STEP_PX * (1.0 - profiles / ground).sum(axis=-1))
+    aside, tangents = np.arange(-half, half + 1e-9, STEP_PX), tangents_of(points)
+    layers = (picture.darkest, picture.brightest)
+    light = np.stack([profiles(layer.pixels, points, aside, tangents) for layer in layers])
+    ground = np.maximum(light[..., [0, 1, -2, -1]].mean(axis=-1, keepdims=True), 1.0)
+    return np.asarray(STEP_PX * (1.0 - light / ground).sum(axis=-1))
 
 
 def looks_alike(picture: Picture, thread: Appearance, points: Points, slack: float) -> bool:
     """Say whether a line is as dark across in both colours as a thread, up to a share and the noise."""
     for values, darkness in zip(_integrals(picture, points, thread.beside_px), thread.darkness, strict=True):
-        usual = float(np.median(values))
+        usual = float(median(values))
         noise = 1.4826 * middle(np.abs(values - usual)) / math.sqrt(max(1.0, len(values) / SMOOTHED_PX))
         if abs(usual - darkness) > slack * float(thread.darkness.max()) + 2.0 * noise:
             return False
     return True
 
 
-def strengths(gray: Gray, points: Points, thread: Appearance, *, two_sided: bool = False) -> Values:
-    """Return how much darker a line's middle is than the floor on the side where it differs more.
+def strand_along(gray: Gray, thread: Appearance, points: Points) -> tuple[Strand, Flags]:
+    """Return a line with where the thread is visible on one side at least, and where it is on both.
 
-    With `two_sided`, where it differs less: next to another strand nothing then, but nothing along an edge either.
+    The strength is how much darker the line's middle is than the floor on the side where it differs more. Where it
+    differs less there is nothing next to another strand, but nothing along an edge either.
     """
     reach = thread.beside_px
-    beside, inside = (sampled(gray, across(points, np.array(at))) for at in ((-reach, reach), (-1, -0.5, 0, 0.5, 1)))
-    return np.asarray((beside.min(axis=1) if two_sided else beside.max(axis=1)) - inside.min(axis=1))
-
-
-def strand_along(gray: Gray, thread: Appearance, points: Points, below: Flags | None = None) -> Strand:
-    """Return a line with where the thread is visible; it is not where `below` is true."""
-    strength = strengths(gray, points, thread)
-    shown = strength > max(FAINTEST, MIN_SHARE * thread.strength)
-    return Strand(points, strength, shown if below is None else shown & ~below)
+    values = profiles(gray, points, np.array([-reach, reach, -1.0, -0.5, 0.0, 0.5, 1.0]))
+    beside = values[:, :2] - values[:, 2:].min(axis=1)[:, None]
+    shown = beside > max(FAINTEST, MIN_SHARE * thread.strength)
+    return Strand(points, beside.max(axis=1), shown.any(axis=1)), shown.all(axis=1)
 
 
 def deviations(thread: Appearance, strand: Strand) -> Values:
@@ -356,10 +361,10 @@ def _fit_light(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArr
     weights = np.zeros((basis.shape[1], values.shape[1]))
     for colour, light in enumerate(values.T):
         own = np.zeros(basis.shape[1])
-        own[0] = np.median(light)
+        own[0] = median(light)
         for _ in range(8):
             residuals = light - basis @ own
-            bound = 4.0 * max(0.5, 1.4826 * float(np.median(np.abs(residuals))))
+            bound = 4.0 * max(0.5, 1.4826 * float(median(np.abs(residuals))))
             weighted = np.maximum(1.0 - (residuals / bound) ** 2, 0.0)[:, None] ** 2 * basis
             before = own
             own = np.linalg.solve(weighted.T @ basis + 1e-6 * np.eye(len(own)), weighted.T @ light)

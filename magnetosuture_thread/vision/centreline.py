@@ -40,6 +40,7 @@ from magnetosuture_thread.vision.images import (
     Picture,
     SceneMask,
     glare_mask,
+    median,
     middle,
     runs,
     sampled,
@@ -245,7 +246,7 @@ def find_arms(ridge: Ridge, dish: Circle, part: NDArray[np.float64]) -> list[Arm
         dish: see `walk_on`.
         part: the vertices of a path that belong to the crossing; see `walk_on`.
     """
-    edge, usual = _edge_around(part[:, :2]), float(np.median(part[:, 4]))
+    edge, usual = _edge_around(part[:, :2]), float(median(part[:, 4]))
     values = sampled(ridge.strength, edge) - ridge.noise
     values = (values + np.roll(values, 1) + np.roll(values, -1)) / 3.0
     turns = 2.0 * np.pi * np.arange(72) / 72
@@ -322,7 +323,7 @@ def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) 
     covariance = np.zeros((3, 3))
     covariance[0, 0], covariance[1:, 1:] = 0.4**2, np.linalg.inv(design.T @ weights)
     begun, curvature = covariance[1:, 1:] @ weights.T @ angles
-    return Arm(path, strong, float(begun), float(curvature), covariance, float(np.median(path[:, 4])))
+    return Arm(path, strong, float(begun), float(curvature), covariance, float(median(path[:, 4])))
 
 
 def arm_of(arms: list[Arm], part: NDArray[np.float64], *, leaving: bool) -> int:
@@ -545,7 +546,7 @@ def _cover_needle(hidden: Gray, needle: MeasuredNeedle) -> None:
 
 def _draw_axis(mask: Gray, needle: MeasuredNeedle, first: float, last: float, width: float) -> None:
     """Draw a part of a needle's axis into a mask, as wide as given [px]."""
-    at = np.round(needle.arc.at(np.linspace(first, last, 24)) * 16.0).astype(np.int32)
+    at = np.round(needle.arc.at(first + (last - first) / 23.0 * np.arange(24.0)) * 16.0).astype(np.int32)
     cv2.polylines(mask, [at], False, 255, max(1, round(width)), cv2.LINE_8, 4)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.vision.images import Gray, measured_channel, middle, sampled, shrunk
+from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, shrunk
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for
@@ -116,12 +116,6 @@ class _Edges:
         normal = at / (ellipse.minor, ellipse.major)
         along = (normal * (self.normals @ ellipse.axes.T)).sum(axis=1)
         return at, np.abs(along) > ALIGNMENT * np.hypot(*normal.T)
-
-
-def find_ellipse(image: np.ndarray) -> Ellipse | None:
-    """Return the inner edge of a dish's wall, by gradients alone; None if no edges agree on one. See `find_rings`."""
-    rings = find_rings(image)
-    return inner_ring(rings) if rings else None
 
 
 @dataclass(frozen=True)
@@ -710,10 +704,6 @@ class DishWatch:
         """Standard deviation of the view's scale, as a share; see `FoundDish`."""
         return self.found.scale_error if self.found is not None else 0.0
 
-    def forget(self) -> None:
-        """Begin anew, as with a camera of another size."""
-        self.found, self._anew, self._searched = None, [], 0
-
     def look(self, image: np.ndarray) -> tuple[str, np.ndarray]:
         """Look at the rim in a frame.
 
@@ -900,7 +890,7 @@ def rim_points(
     ways, count = np.column_stack([np.cos(turns), np.sin(turns)]), int(2.0 * reach / step)
     radii, places = radius - reach + step * np.arange(count), np.arange(count)
     profiles = sampled(gray, centre + radii[:, None] * ways[:, None])
-    inside, dark = np.median(profiles[:, : max(3, count // 8)], axis=1), profiles.min(axis=1)
+    inside, dark = median(profiles[:, : max(3, count // 8)], axis=1), profiles.min(axis=1)
     half = 0.5 * (inside + dark)
     index = (profiles < half[:, None]).argmax(axis=1)
     seen = (inside - dark >= np.maximum(MIN_CONTRAST, 0.15 * inside)) & (index > 0)
@@ -947,11 +937,13 @@ def fit_circle(points: Points, agreement: float) -> Circle | None:
     for tolerance in (8.0 * agreement, 3.0 * agreement, agreement):
         if len(kept) < 20:
             return None
-        mean = kept.mean(axis=0)  # around which the equations are well conditioned
+        mean = kept.mean(axis=0)  # around which the equations are well conditioned, and that of c stands alone
         x, y = (kept - mean).T
-        basis = np.stack([2.0 * x, 2.0 * y, np.ones_like(x)])
-        u, v, c = np.linalg.solve(basis @ basis.T + 1e-9 * np.eye(3), basis @ (x * x + y * y))
-        radius, centre = math.sqrt(max(c + u * u + v * v, 0.0)), mean + np.array([u, v])
+        squares = x * x + y * y
+        xx, xy, yy, xs, ys = x @ x, x @ y, y @ y, x @ squares, y @ squares
+        determinant = 2.0 * max(xx * yy - xy * xy, 1e-9)
+        u, v = (yy * xs - xy * ys) / determinant, (xx * ys - xy * xs) / determinant
+        radius, centre = math.sqrt(float(squares.mean()) + u * u + v * v), mean + np.array([u, v])
         kept = points[np.abs(np.hypot(*(points - centre).T) - radius) < tolerance]
     return float(centre[0]), float(centre[1]), radius, len(kept)
 

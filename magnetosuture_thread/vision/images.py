@@ -16,7 +16,7 @@ import io
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.geometry.scene import Scene
@@ -38,52 +38,33 @@ OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
 
 CELL_PX = 8  # side of a cell of the grid on which the floor's brightness is known
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
+NEXT = np.uint64(1)  # Indices without a sign save compiled code the check for negative ones, which count from the end.
 FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 
 Gray = NDArray[np.uint8]
 
 
-class Encoding(NamedTuple):
-    """How the pixels of a raw image lie in memory.
-
-    Attributes:
-        bits: of a value.
-        values: in a row, for each pixel.
-        conversion: OpenCV's to BGR; None for pixels that are grey or BGR.
-        block: side of the square of pixels that share their colour.
-    """
-
-    bits: int
-    values: int
-    conversion: int | None = None
-    block: int = 1
-
-
-# By the names of sensor_msgs/image_encodings, and nv12 as drivers name it.
-ENCODINGS = {
-    name: Encoding(8, values, code, block=2)
-    for names, values, code in (
-        (("yuv422", "uyvy"), 2, cv2.COLOR_YUV2BGR_UYVY),
-        (("yuv422_yuy2", "yuyv"), 2, cv2.COLOR_YUV2BGR_YUYV),
-        (("nv12",), 1, cv2.COLOR_YUV2BGR_NV12),
-        (("nv21",), 1, cv2.COLOR_YUV2BGR_NV21),
-    )
-    for name in names
+# Values a pixel and OpenCV's conversion to BGR, None of grey and BGR, by the names of sensor_msgs/image_encodings, and
+# nv12 as drivers name it.
+ENCODINGS: dict[str, tuple[int, int | None]] = {
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2BGR_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2BGR_YUYV)),
+    "nv12": (1, cv2.COLOR_YUV2BGR_NV12),
+    "nv21": (1, cv2.COLOR_YUV2BGR_NV21),
 }
 for _bits in (8, 16):
-    for _names, _values, _conversion in (
-        (("mono{}", "{}UC1"), 1, None),
-        (("bgr{}", "{}UC3"), 3, None),
-        (("rgb{}",), 3, cv2.COLOR_RGB2BGR),
-        (("bgra{}", "{}UC4"), 4, cv2.COLOR_BGRA2BGR),
-        (("rgba{}",), 4, cv2.COLOR_RGBA2BGR),
+    ENCODINGS |= {
+        **dict.fromkeys((f"mono{_bits}", f"{_bits}UC1"), (1, None)),
+        **dict.fromkeys((f"bgr{_bits}", f"{_bits}UC3"), (3, None)),
+        **dict.fromkeys((f"bgra{_bits}", f"{_bits}UC4"), (4, cv2.COLOR_BGRA2BGR)),
+        f"rgb{_bits}": (3, cv2.COLOR_RGB2BGR),
+        f"rgba{_bits}": (4, cv2.COLOR_RGBA2BGR),
         # OpenCV names a pattern by the second and third pixel of its second row.
-        (("bayer_rggb{}",), 1, cv2.COLOR_BayerBG2BGR),
-        (("bayer_bggr{}",), 1, cv2.COLOR_BayerRG2BGR),
-        (("bayer_gbrg{}",), 1, cv2.COLOR_BayerGR2BGR),
-        (("bayer_grbg{}",), 1, cv2.COLOR_BayerGB2BGR),
-    ):
-        ENCODINGS |= {name.format(_bits): Encoding(_bits, _values, _conversion) for name in _names}
+        f"bayer_rggb{_bits}": (1, cv2.COLOR_BayerBG2BGR),
+        f"bayer_bggr{_bits}": (1, cv2.COLOR_BayerRG2BGR),
+        f"bayer_gbrg{_bits}": (1, cv2.COLOR_BayerGR2BGR),
+        f"bayer_grbg{_bits}": (1, cv2.COLOR_BayerGB2BGR),
+    }
 
 
 @dataclass(frozen=True)
@@ -404,23 +385,24 @@ def unpack_image(
     Raises:
         InvalidInputError: the encoding is another, or the sizes don't fit the data.
     """
-    if (form := ENCODINGS.get(encoding)) is None:
+    if encoding not in ENCODINGS:
         expected = "one that OpenCV converts to BGR, as bgr8, mono16, bayer_rggb8, yuv422 or nv12"
         raise InvalidInputError("image.encoding", repr(encoding), expected)
-    buffer, length = np.frombuffer(data, dtype=np.uint8), width * form.values * form.bits // 8
-    planar = form.block == 2 and form.values == 1
+    (values, conversion), is_wide = ENCODINGS[encoding], "16" in encoding
+    pixel, planar = values * (1 + is_wide), encoding.startswith("nv")
+    buffer = np.frombuffer(data, dtype=np.uint8)
     rows = height * 3 // 2 if planar else height
-    whole = width % form.block == 0 and not (planar and height % 2)
-    if height < 1 or width < 1 or step < length or buffer.size != rows * step or not whole:
+    whole = not (planar and height % 2) and not ((planar or values == 2) and width % 2)  # colours of two pixels
+    if height < 1 or width < 1 or step < width * pixel or buffer.size != rows * step or not whole:
         sizes = f"{buffer.size} bytes for {width} x {height}, step {step}"
-        expected = f"{rows} rows of step bytes, {form.values * form.bits // 8} for each of {width} pixels"
+        expected = f"{rows} rows of step bytes, {pixel} for each of {width} pixels"
         raise InvalidInputError("image.step", sizes, expected)
-    pixels = buffer.reshape(rows, step)[:, :length]
-    if form.bits == 16:
+    pixels = buffer.reshape(rows, step)[:, : width * pixel]
+    if is_wide:
         pixels = np.ascontiguousarray(pixels).view(">u2" if big_endian else "<u2").astype(np.uint16, copy=False)
-    if form.values > 1:
-        pixels = pixels.reshape(height, width, form.values)
-    return eight_bits(pixels if form.conversion is None else np.asarray(cv2.cvtColor(pixels, form.conversion)))
+    if values > 1:
+        pixels = pixels.reshape(height, width, values)
+    return eight_bits(pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion)))
 
 
 def check_image(image: np.ndarray) -> None:
@@ -435,7 +417,7 @@ def check_image(image: np.ndarray) -> None:
 
 def measured_channel(image: np.ndarray) -> np.ndarray:
     """Return the channel to measure on: green, which a colour sensor samples twice as densely."""
-    return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])
+    return np.ascontiguousarray(image if image.ndim == 2 else cv2.extractChannel(image, 1))
 
 
 def middle(values: np.ndarray) -> float:
@@ -444,10 +426,20 @@ def middle(values: np.ndarray) -> float:
     return float(np.partition(values, half, axis=None)[half])
 
 
+def median(values: NDArray[Any], axis: int = -1) -> NDArray[Any]:
+    """Return the medians of finite floating-point values along an axis; numpy's own takes four times as long."""
+    count = values.shape[axis]
+    low, high = (count - 1) // 2, count // 2
+    ordered = np.partition(values, (low, high), axis)
+    return np.asarray(0.5 * (ordered.take(low, axis) + ordered.take(high, axis)))
+
+
 def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return first index and the one after the last of each run of true flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+    padded = np.zeros(len(flags) + 2, np.bool_)
+    padded[1:-1] = flags
+    edges = np.flatnonzero(padded[1:] != padded[:-1]).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
@@ -465,19 +457,20 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
     return values
 
 
-@compiled
+@compiled_inline
 def sample(image, u, v):
     """Return an image at a point, bilinear; 0 outside."""
-    column, row = int(np.floor(u)), int(np.floor(v))
-    if column < 0 or row < 0 or column >= image.shape[1] - 1 or row >= image.shape[0] - 1:
+    if not (0.0 <= u < image.shape[1] - 1 and 0.0 <= v < image.shape[0] - 1):
         return 0.0
+    column, row = int(u), int(v)
     x, y = u - column, v - row
-    upper = image[row, column] * (1.0 - x) + image[row, column + 1] * x
-    lower = image[row + 1, column] * (1.0 - x) + image[row + 1, column + 1] * x
+    left, above = np.uint64(column), np.uint64(row)
+    upper = image[above, left] * (1.0 - x) + image[above, left + NEXT] * x
+    lower = image[above + NEXT, left] * (1.0 - x) + image[above + NEXT, left + NEXT] * x
     return upper * (1.0 - y) + lower * y
 
 
-@compiled
+@compiled_inline
 def within(image, u, v):
     """Return an image at a point, bilinear; outside, at the nearest point of its border."""
     u = min(max(u, 0.0), image.shape[1] - 1.001)
@@ -485,14 +478,23 @@ def within(image, u, v):
     return sample(image, u, v)
 
 
-@compiled
+@compiled_uncounted
 def sample_all(image, points, values):
     """Fill in an image at points, shape (m, 2); see `within`."""
     for index in range(len(points)):
         values[index] = within(image, points[index, 0], points[index, 1])
 
 
-@compiled
+@compiled_uncounted
+def sample_across(image, points, tangents, aside, values):
+    """Fill in an image at distances aside of points, shape (m, n); see `within`."""
+    for row in range(len(points)):
+        u, v, along, down = points[row, 0], points[row, 1], tangents[row, 0], tangents[row, 1]
+        for column in range(len(aside)):
+            values[row, column] = within(image, u - aside[column] * down, v + aside[column] * along)
+
+
+@compiled_uncounted
 def straighten(gray, start, along, aside, strip):
     """Fill a strip with the image along an arc; see `Arc.at`.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
-from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, SceneMask, middle
+from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, SceneMask, median, middle
 from magnetosuture_thread.vision.template import (
     BESIDE_PX,
     BLOOM_PX,
@@ -139,7 +139,7 @@ def _dark_components(picture: Picture, radius: float, cut: float, area: float, l
     cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
     cv2.bitwise_and(dark, inside, dark)
     if picture.mask is not None:
-        dark[picture.mask.depth > cut] = 0
+        cv2.bitwise_and(dark, cv2.compare(picture.mask.depth, cut, cv2.CMP_LE), dark)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     result = []
     for outline in outlines:
@@ -225,7 +225,8 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         return "hidden"
     if abs(best.arc.curvature) * best.length > 1.25 * math.pi:
         return "bent beyond a half circle"
-    if _excess(steel.surely, best, width)[2] > 0.1:  # of the rows
+    excess = _excess(steel.surely, best, width)
+    if excess[2] > 0.1:  # of the rows
         return "something dark against it"
     is_known = True
     pointed = min((one, other), key=lambda each: each.cost)
@@ -237,7 +238,7 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
             tolerance = size.tolerance if is_measured else 0.0
             rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
         fit, is_known = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
-    beyond_tip, beyond_tail, _ = _excess(steel.surely, fit, width)
+    beyond_tip, beyond_tail, _ = excess if fit is best else _excess(steel.surely, fit, width)
     if reason := _what_prolongs(steel, fit, (beyond_tip, beyond_tail), is_known):
         return reason
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
@@ -615,7 +616,7 @@ def _fading(surely: np.ndarray, fit: TemplateFit) -> float:
     # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
     tail = _fade(beyond, fit.arc.strip(surely, beyond, across).min(axis=1))
     body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
-    sides = (np.median(fit.arc.strip(surely, body, side * outside), axis=0) for side in (-1.0, 1.0))
+    sides = (median(fit.arc.strip(surely, body, side * outside), axis=0) for side in (-1.0, 1.0))
     return tail - min(_fade(-outside, usual) for usual in sides)
 
 
@@ -639,6 +640,6 @@ def _lies_over_tail(steel: SteelMap, fit: TemplateFit) -> bool:
     """
     aside = 0.35 * fit.width
     across = np.array([-aside, -0.75, 0.0, 0.75, aside])
-    left, beside, centre, other, right = np.median(fit.arc.strip(steel.dark, np.arange(2.0, 12.0), across), axis=0)
+    left, beside, centre, other, right = median(fit.arc.strip(steel.dark, np.arange(2.0, 12.0), across), axis=0)
     most = max(abs(left - right), abs(beside - other), 0.5 * (beside + other) - centre)
     return bool(most > 0.12 * steel.depth)

@@ -29,14 +29,12 @@ from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObs
 from magnetosuture_thread.vision.appearance import (
     FAINTEST,
     GAP_PX,
-    MIN_SHARE,
     OBJECT_GAP_PX,
     SPACING_PX,
     WALL_PX,
     Appearance,
     Hiding,
     Strand,
-    across,
     appearance_of,
     below_needle,
     deviations,
@@ -47,12 +45,11 @@ from magnetosuture_thread.vision.appearance import (
     parts_without,
     respaced,
     strand_along,
-    strengths,
     tangents_of,
 )
 from magnetosuture_thread.vision.arc import MeasuredNeedle
 from magnetosuture_thread.vision.centreline import chances_of, cubic
-from magnetosuture_thread.vision.images import Gray, Picture, middle, runs, sampled
+from magnetosuture_thread.vision.images import Gray, Picture, median, middle, runs, sampled
 from magnetosuture_thread.vision.walk import Ridge, path_buffers, walk_on
 
 MIN_SEED_PX, MIN_LENGTH_PX = 6, 12.0  # of a ridge from which a walk begins, and of a piece
@@ -97,13 +94,13 @@ def observe(
     walk = respaced(walk, SPACING_PX)
     view, below = picture.view, below_needle(needle, walk)
     thread = appearance_of(picture, gray, walk, ~below)
-    line = strand_along(gray, thread, walk, below)
+    line, plain = strand_along(gray, thread, walk)
+    line = replace(line, visible=line.visible & ~below)
     length = thread_length / view.metres_per_pixel
     begin = first_clear_of(needle, walk)
     gone = gaps_of(line.visible, GAP_PX, begin)
     parts = parts_without(line, gone)
     in_dish = _Dish(view, thread, scale_known)
-    plain = strengths(gray, walk, thread, two_sided=True) > max(FAINTEST, MIN_SHARE * thread.strength)
     gapless = not gone.any() and not gaps_of(plain | below, OBJECT_GAP_PX, begin).any()
     if gapless and _is_whole(line.points, length):  # Nothing is left of the thread to look for.
         ends_bare = is_bare_beyond(picture, gray, thread, parts[0], needle)
@@ -131,7 +128,7 @@ def observe(
     remaining = length * (1.0 + LENGTH_TOLERANCE) - sum(float(arc_lengths(each)[-1]) for each in known)
     others = known[1:] + find_pieces(picture, gray, thread, hiding, known, remaining)
     strands = [begun]
-    strands += [strand_along(gray, thread, respaced(other, SPACING_PX)) for other in others]
+    strands += [strand_along(gray, thread, respaced(other, SPACING_PX))[0] for other in others]
     ends, areas = [], []
     for number, strand in enumerate(strands):
         first_end, first_area = (PieceEnd.TAIL, 0)
@@ -520,14 +517,13 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
     """Say whether there is nothing but floor beyond a piece's last point, like that beside it, where it is strong."""
     if len(strand.points) < BESIDE_POINTS:
         return False
-    usual = float(np.median(strand.strength[-BESIDE_POINTS:]))
+    usual = float(median(strand.strength[-BESIDE_POINTS:]))
     if usual < max(2.0 * FAINTEST, 4.0 * thread.noise):
         return False
     point, way = strand.points[-1], end_direction(strand.points)
     angle = math.atan2(way[1], way[0])
-    turns = np.linspace(-AHEAD, AHEAD, 9)
-    reach = np.array(AHEAD_PX)
-    ahead = point + reach[:, None, None] * np.stack([np.cos(angle + turns), np.sin(angle + turns)], axis=-1)[None]
+    turns, reach = angle + AHEAD * np.arange(-1.0, 1.1, 0.25), np.array(AHEAD_PX)
+    ahead = point + reach[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     rows, columns = gray.shape
     if ahead.min() < 2.0 or (ahead > np.array([columns, rows]) - 3.0).any():
         return False
@@ -535,12 +531,13 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
         return False
     aside = thread.beside_px + np.array([0.5, 1.5, 2.5])
     last = strand.points[-BESIDE_POINTS - 1 :]  # with one more, for the direction at the first
-    beside = across(last, np.concatenate([-aside, aside]))[-BESIDE_POINTS:]
-    floor, beyond = float(np.median(sampled(gray, beside))), sampled(gray, ahead)
+    normals = (tangents_of(last)[:, ::-1] * (-1.0, 1.0))[-BESIDE_POINTS:]
+    beside = last[-BESIDE_POINTS:, None] + np.concatenate([-aside, aside])[:, None] * normals[:, None]
+    floor, beyond = float(median(sampled(gray, beside).ravel())), sampled(gray, ahead)
     if floor - float(beyond[1:].min()) > max(0.5 * usual, FAINTEST + 3.0 * thread.noise):  # It goes on.
         return False
-    light = np.vstack([np.median(np.atleast_3d(sampled(picture.image, at)), axis=1) for at in (beside, ahead)])
-    light /= np.maximum(np.median(light[: len(beside)], axis=0), 1.0)
+    light = np.vstack([median(np.atleast_3d(sampled(picture.image, at)), axis=1) for at in (beside, ahead)])
+    light /= np.maximum(median(light[: len(beside)], axis=0), 1.0)
     mean = light.mean(axis=1)
     step = np.abs(OFF_LINE @ mean).max()
     even = step < 0.025 and np.abs(mean - 1.0).max() < 0.06

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner
 from magnetosuture_thread.vision.arc import Arc
-from magnetosuture_thread.vision.images import Layer, Picture
+from magnetosuture_thread.vision.images import NEXT, Layer, Picture
 
 AROUND_PX = 12.0  # around a dark thing, that is measured on
 GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
@@ -38,7 +38,6 @@ MAX_STEP_PX = 1.5  # of a round
 FIRST_ROUNDS = 4  # that tell which of several fits is worth more
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
-NEXT = np.uint64(1)  # Indices without a sign save compiled code the check for negative ones, which count from the end.
 REACH_PX, LEVEL_PX = 4.5, 2.0  # to both sides of the end; from where on, two deviations of the blur, its step is over
 EDGE_STEP_PX, SIDE_PX = 0.25, 0.5  # between samples along the axis, and between lines
 MAX_SHIFT_PX = 1.0  # from where the end is drawn; beyond, and where lines differ more, something hides it
@@ -225,13 +224,13 @@ def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
     return np.asarray(turn @ inverse[:4, :4] @ turn.T)
 
 
-@compiled
+@compiled_inline
 def edge(x):
     """Return how much of a blurred edge is covered at a distance inside of it, about a normal distribution."""
     return 1.0 / (1.0 + math.exp(-STEEPNESS * x))
 
 
-@compiled
+@compiled_inner
 def _half_width(s, length, half, thin):
     """Return half of a needle's width at a place along it, and its derivative by the length."""
     part = (s - (1.0 - TAPER) * length) / (TAPER * length)
@@ -242,7 +241,7 @@ def _half_width(s, length, half, thin):
     return half * (1.0 - (1.0 - thin) * part), half * (1.0 - thin) * s / (TAPER * length * length)
 
 
-@compiled
+@compiled_inner
 def _across(own, aside, share, slope):
     """Fill in the share of steel across a body of half a width, and its derivative by that; `aside` is symmetric.
 
@@ -293,7 +292,7 @@ def _draw_needle(along, aside, length, half, bloom, thin, drawn, wider, longer):
                 wider[row, column] = longer[row, column] = 0.0
 
 
-@compiled
+@compiled_inner
 def _add_row(own, right, turned, bent, shape, end, rest):
     """Add a row's sums to the lower half of the normal equations; slopes by angle and bend are multiples of b."""
     aa, ab, bb, aw, bw, ww = shape
@@ -351,7 +350,7 @@ def _solve(normal, right, result):
         result[i] = total / lower[i, i]
 
 
-@compiled
+@compiled_inner
 def straighten_both(one, other, start, first, aside, strip, other_strip):
     """Fill two strips with two images along an arc at steps of a pixel; see `Arc.strip`.
 
@@ -479,8 +478,10 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
             cost += length_prior * (own_length - length) ** 2
         if cost < best:
             best, samples = cost, rows * columns
-            best_state[:] = state
-            normal[:] = own
+            for i in range(PARAMETERS):  # to copy an array at once takes seconds to compile
+                best_state[i] = state[i]
+                for j in range(PARAMETERS):
+                    normal[i, j] = own[i, j]
         # A round lowers the cost of a fit that begins at the axis of another by half at most.
         if best > hopeless * max(1.0, 1.5 ** (FIRST_ROUNDS - done)):
             break
@@ -500,7 +501,8 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         state[5] = min(max(state[5] + change[5], shortest), longest)
         if largest < 0.02:  # px
             break
-    state[:] = best_state
+    for i in range(PARAMETERS):
+        state[i] = best_state[i]
     return best, samples
 
 
@@ -526,66 +528,62 @@ def tail_shift(steel: SteelMap, fit: TemplateFit) -> float | None:
 def _shift_of(along, dark, depth):
     """Return the shift of `tail_shift` by the darkness at places along the lines, shape (places, lines); NaN: none."""
     lines = dark.shape[1]
-    body, near = np.empty(lines), np.empty(lines)
-    mean, slope, ends = np.empty(lines), np.empty(lines), np.empty(lines)
+    ends, near = np.empty(lines), np.empty(lines)
     shift = 0.0
     for _ in range(2):  # The second time by levels around the end that the first one found.
-        body[:], near[:], mean[:], slope[:] = 0.0, -np.inf, 0.0, 0.0
-        inside, outside, middle, square = 0, 0, 0.0, 0.0
-        for row in range(len(along)):
-            s = along[row]
-            if shift + LEVEL_PX < s < shift + 2.0 * LEVEL_PX:
-                inside += 1
-                body += dark[row]
-            if shift - REACH_PX < s < shift - LEVEL_PX:
-                outside += 1
-                middle += s
-                mean += dark[row]
-            if shift - REACH_PX < s < shift - 1.25:  # px; a thread is told from the end itself
-                near = np.maximum(near, dark[row])
-        body /= inside
-        mean /= outside
-        middle /= outside
-        for row in range(len(along)):
-            if shift - REACH_PX < along[row] < shift - LEVEL_PX:
-                square += (along[row] - middle) ** 2
-                slope += (along[row] - middle) * dark[row]
-        behind = mean + slope / square * (shift - middle)
         rising, thread = 0, np.inf
         for line in range(lines):
+            body, behind, near[line] = _levels(along, dark, line, shift)
             ends[line] = np.nan
-            if body[line] - behind[line] > 0.3 * depth:  # of the darkness of steel
+            if body - behind > 0.3 * depth:  # of the darkness of steel
                 rising += 1
                 thread = min(thread, near[line])
-                ends[line] = _crossing(along, dark[:, line], 0.5 * (body[line] + behind[line]))
+                ends[line] = _crossing(along, dark, line, 0.5 * (body + behind))
                 if math.isnan(ends[line]):
                     return np.nan
         if rising < 3:
             return np.nan
-        total, place = 0.0, 0.0
-        weights = np.zeros(lines)
+        total, place, spread = 0.0, 0.0, 0.0
+        for line in range(lines):
+            near[line] = 1.0 / (1.0 + ((near[line] - thread) / (0.02 * depth)) ** 2)  # the line's weight
+            if not math.isnan(ends[line]):
+                total += near[line]
+                place += near[line] * ends[line]
+        shift = place / total
         for line in range(lines):
             if not math.isnan(ends[line]):
-                more = (near[line] - thread) / (0.02 * depth)  # of the darkness of steel: half the weight
-                weights[line] = 1.0 / (1.0 + more * more)
-                total += weights[line]
-                place += weights[line] * ends[line]
-        shift = place / total
-        spread = 0.0
-        for line in range(lines):
-            if weights[line] > 0.0:
-                spread += weights[line] * abs(ends[line] - shift) / total
+                spread += near[line] * abs(ends[line] - shift) / total
         if not abs(shift) < MAX_SHIFT_PX or spread > 0.5:
             return np.nan
     return shift
 
 
-@compiled
-def _crossing(along, dark, half):
-    """Return the last place at which the darkness rises above a level; NaN if it does not."""
+@compiled_inner
+def _levels(along, dark, line, shift):
+    """Return the mean darkness within the needle, that of the floor at its end, and the greatest behind it."""
+    inside, outside, body, near = 0, 0, 0.0, -np.inf
+    places, squares, levels, products = 0.0, 0.0, 0.0, 0.0
+    for row in range(len(along)):
+        s, value = along[row] - shift, dark[row, line]
+        if LEVEL_PX < s < 2.0 * LEVEL_PX:
+            inside += 1
+            body += value
+        if -REACH_PX < s < -LEVEL_PX:  # where a line is fitted to the floor
+            outside += 1
+            places, squares = places + s, squares + s * s
+            levels, products = levels + value, products + s * value
+        if -REACH_PX < s < -1.25:  # px; a thread is told from the end itself
+            near = max(near, value)
+    slope = (outside * products - places * levels) / (outside * squares - places * places)
+    return body / inside, (levels - slope * places) / outside, near
+
+
+@compiled_inner
+def _crossing(along, dark, line, half):
+    """Return the last place at which the darkness rises along a line above a level; NaN if it does not."""
     for row in range(len(dark) - 2, -1, -1):
-        if dark[row] < half:
-            if dark[row + 1] <= half:
+        if dark[row, line] < half:
+            if dark[row + 1, line] <= half:
                 return np.nan
-            return along[row] + EDGE_STEP_PX * (half - dark[row]) / (dark[row + 1] - dark[row])
+            return along[row] + EDGE_STEP_PX * (half - dark[row, line]) / (dark[row + 1, line] - dark[row, line])
     return np.nan

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -38,12 +39,12 @@ from magnetosuture_thread.vision.observe import observe
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.walk import Ridge, smoothed, walk_on, worth
 
-MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 UNDIRECTED = "the needle's axis is found, but not which end is the tip: click it on the page, or by --tip or needle/tip"
 TIP_REACH = 1.0 / 3.0  # of the length, from a point that a person gives: the other end is then twice as far or more
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
+SEARCH_PERIOD = 0.25  # s between frames of which all is searched for a thread that seems cut; it takes a frame's time
 REPEATED = "camera repeats frames"
 MAX_CYCLE = 100  # frames; after more of them a repetition is not found
 
@@ -99,6 +100,9 @@ class Track:
     def axis(self) -> Points:
         """Both ends of the needle, its tail first, which may be either if there is a reason, shape (2, 2) or (0, 2)."""
         return np.vstack([self.tail, self.tip]) if len(self.tail) else np.empty((0, 2))
+
+
+PoseCallback = Callable[[Track], None]
 
 
 def no_pose(state: State, reason: str, view: DishView | None) -> Track:
@@ -189,6 +193,7 @@ class VisionTracker:
         self._last: _Pose | None = None
         self._anew: list[_Pose] = []
         self._thread: Points = np.empty((0, 2))  # in pixels, with the needle's ends
+        self._searched = -math.inf  # time of the last frame that was searched as a whole for the thread
 
     def point_at_tip(self, place: Points, until: float = math.inf) -> None:
         """Take a point near the needle's tip, as a person gives it.
@@ -219,7 +224,7 @@ class VisionTracker:
         self._mask, self._tip = alone._mask, alone._tip
         return replace(found, state=State.TRACKED if found.state is State.TRACKED else State.LOST, needle_length=None)
 
-    def track(self, image: np.ndarray, time_s: float) -> Track:
+    def track(self, image: np.ndarray, time_s: float, on_pose: PoseCallback | None = None) -> Track:
         """Look at the next frame.
 
         A needle near enough to where the last ones predict it is tracked at once. One found elsewhere
@@ -229,6 +234,8 @@ class VisionTracker:
         Args:
             image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
             time_s: when the frame was taken [s], on any clock.
+            on_pose: called once the needle is found, before the thread is measured, which takes longer: with what is
+                returned, but without thread, view and warning.
 
         Raises:
             InvalidInputError: the image is not of this kind, or the frame is not newer than the last one.
@@ -244,7 +251,7 @@ class VisionTracker:
             problem = self._lens.problem_with(image.shape)
             small = self._lens.undistorted(small, self._factor) if problem is None else small
         left, top, right, bottom = self._region_px
-        found = self._track(np.ascontiguousarray(small[top:bottom, left:right]), time_s)
+        found = self._track(np.ascontiguousarray(small[top:bottom, left:right]), time_s, on_pose)
         dish = self._dish.found.warning if self._dish.found is not None else ""
         warning = "; ".join(filter(None, (dish, f"{problem}; it is not used" if problem is not None else "")))
         found = replace(found, warning=warning, needle_length=self._length.length, scale_error=self._dish.scale_error)
@@ -254,7 +261,7 @@ class VisionTracker:
         view = replace(found.view, centre_px=(u + left, v + top)).shrunk(1.0 / self._factor)
         return replace(found, view=view)
 
-    def _track(self, image: np.ndarray, time_s: float) -> Track:
+    def _track(self, image: np.ndarray, time_s: float, on_pose: PoseCallback | None) -> Track:
         """Look at the next frame, shrunk."""
         if self._last is not None and time_s - self._last.time > self._settings.forget_after:
             self._last = None
@@ -269,16 +276,22 @@ class VisionTracker:
         needle, picture, whole, reason = self._choose(image, time_s)
         if needle is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        found = self._measured(picture, needle, search=whole)
-        if not whole and self._is_cut(found, picture):
-            complete = self._picture(image)
+        pose = self._pose_of(needle, picture.view)
+        if on_pose is not None:
+            on_pose(pose)
+        line, observation = self._measured(picture, needle, search=whole)
+        searches = whole
+        if not whole and time_s - self._searched >= SEARCH_PERIOD and self._is_cut(needle, line, observation, picture):
+            searches, complete = True, self._picture(image)
             needle = needle.shifted(np.subtract(complete.view.centre_px, picture.view.centre_px))
-            found = self._measured(complete, needle, search=True)
+            line, observation = self._measured(complete, needle, search=True)
+        if searches:
+            self._searched = time_s
         if needle.heading_known:
             if needle.size_measured:
                 self._length.add((needle.length_px - needle.tail_shift_px) * view.metres_per_pixel, needle.confidence)
-            self._thread = view.to_pixels(np.vstack([found.tail, found.tip, found.centreline]))
-        return found
+            self._thread = view.to_pixels(np.vstack([pose.tail, pose.tip, line]))
+        return replace(pose, centreline=line, view=view, observation=observation)
 
     def _advance(self, time_s: float) -> None:
         """Take the time of the next frame."""
@@ -355,14 +368,10 @@ class VisionTracker:
         chosen = within[0] if len(within) == 1 else self._with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
-            if chosen is None:
-                return (
-                    None,
-                    None,
-                    True,
-                    f"{len(needles)} needles in the dish: point at the tip of one, or limit region_px",
-                )
-            return chosen, picture, True, ""
+            if chosen is not None:
+                return chosen, picture, True, ""
+            remedy = "point at the tip of one, or limit region_px"
+            return None, None, True, f"{len(needles)} needles in the dish: {remedy}"
         pose = _pose(chosen, picture, time)
         if self._fits(pose, last):
             self._take(pose, last)
@@ -422,27 +431,18 @@ class VisionTracker:
         """
         if not needle.heading_known:
             return needle.tail_px[None]
-        max_length = MAX_LENGTH_RATIO * self._settings.thread_length / picture.view.metres_per_pixel
-        return find_centreline(picture, gray, needle, max_length)
+        length = self._settings.thread_length / picture.view.metres_per_pixel
+        return find_centreline(picture, gray, needle, 1.05 * length)  # beyond which a walk is of something else
 
-    def _measured(self, picture: Picture, needle: MeasuredNeedle, *, search: bool) -> Track:
-        """Return what a picture shows of a needle and its thread.
+    def _pose_of(self, needle: MeasuredNeedle, view: DishView) -> Track:
+        """Return what a needle tells, without the thread.
 
         Args:
-            picture: the frame or a part of it.
-            needle: in its pixels.
-            search: whether to look for pieces of the thread that the centreline does not show; see `observe`.
+            needle: in the pixels of a picture.
+            view: of that picture.
         """
-        dish, view, radius = self._found_dish(), picture.view, self._scene.dish.radius
+        dish, radius = self._found_dish(), self._scene.dish.radius
         heading, tail = view.directions_to_dish(needle.direction_px), view.to_dish(needle.tail_edge_px)
-        gray = without_needle(picture.darkest, needle)
-        line = self._centreline(picture, gray, needle)
-        scale_known = self._settings.metres_per_pixel > 0.0
-        length = self._settings.thread_length
-        observation = observe(picture, smoothed(gray), needle, line, length, scale_known=scale_known, search=search)
-        if dish.tilt is not None:  # What a straight camera's view leaves unknown moves all points alike.
-            pieces = tuple(_less_sure(piece, dish, radius) for piece in observation.pieces)
-            observation = replace(observation, pieces=pieces)
         return Track(
             state=State.TRACKED if needle.heading_known else self._missing(),
             reason="" if needle.heading_known else UNDIRECTED,
@@ -452,18 +452,38 @@ class VisionTracker:
             heading=heading,
             curvature=-needle.curvature_px / view.metres_per_pixel,
             covariance=_in_dish(needle, view) + dish.covariance(tail, heading, radius),
-            centreline=view.to_dish(line),
-            view=dish.view,
-            observation=observation,
+            centreline=np.empty((0, 2)),
+            view=None,
         )
 
-    def _is_cut(self, found: Track, picture: Picture) -> bool:
+    def _measured(self, picture: Picture, needle: MeasuredNeedle, *, search: bool) -> tuple[Points, ThreadObservation]:
+        """Return the thread's centreline from the tail on, shape (m, 2) [m], and what a picture shows of the thread.
+
+        Args:
+            picture: the frame or a part of it.
+            needle: in its pixels.
+            search: whether to look for pieces of the thread that the centreline does not show; see `observe`.
+        """
+        dish = self._found_dish()
+        gray = without_needle(picture.darkest, needle)
+        line = self._centreline(picture, gray, needle)
+        scale_known = self._settings.metres_per_pixel > 0.0
+        length = self._settings.thread_length
+        observation = observe(picture, smoothed(gray), needle, line, length, scale_known=scale_known, search=search)
+        if dish.tilt is not None:  # What a straight camera's view leaves unknown moves all points alike.
+            pieces = tuple(_less_sure(piece, dish, self._scene.dish.radius) for piece in observation.pieces)
+            observation = replace(observation, pieces=pieces)
+        return picture.view.to_dish(line), observation
+
+    def _is_cut(
+        self, needle: MeasuredNeedle, centreline: Points, observation: ThreadObservation, picture: Picture
+    ) -> bool:
         """Say whether the thread may go on beyond the part of the frame that was looked at."""
-        if found.reason:
+        if not needle.heading_known:
             return False
-        if not found.observation.complete:
+        if not observation.complete:
             return True
-        line = picture.view.to_pixels(found.centreline)
+        line = picture.view.to_pixels(centreline)
         if arc_lengths(line)[-1] < 0.9 * arc_lengths(self._thread[2:])[-1]:  # of the thread before
             return True
         (u, v), (rows, columns) = line[-1], picture.shape
@@ -629,13 +649,15 @@ class TrackerSession:
         """Take the camera's lens; see `VisionTracker.set_lens`."""
         self._tracker.set_lens(lens)
 
-    def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:
+    def on_image(self, time_s: float, image: np.ndarray, on_pose: PoseCallback | None = None) -> FrameMeasurement:
         """Look at the next frame, taken at a time [s]; see `VisionTracker.track`. One that came before has no pose."""
         try:
-            track = self._tracker.track(image, time_s)
+            check_image(image)
+            repeated = self._repetition.is_repeated(time_s, image)
+            track = self._tracker.track(image, time_s, None if repeated else on_pose)
         except InvalidInputError as error:
             return self.on_broken(error)
-        if self._repetition.is_repeated(time_s, image) and len(track.tail):
+        if repeated and len(track.tail):
             track = no_pose(self.missing, REPEATED, track.view)
         self.frames += 1
         self.tracked += track.state is State.TRACKED

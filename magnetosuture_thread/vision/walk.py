@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted
 from magnetosuture_thread.vision.images import middle, sample
 
 STEP_PX = 2.0  # of the walk
@@ -73,7 +73,7 @@ def smoothed(gray: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.GaussianBlur(gray, (5, 5), 0.7))
 
 
-@compiled
+@compiled_inline
 def is_hidden(ridge, u, v):
     """Say whether a point of a ridge is hidden."""
     c, r = int(u + 0.5), int(v + 0.5)
@@ -82,14 +82,20 @@ def is_hidden(ridge, u, v):
     return ridge.hidden[r, c] != 0
 
 
-@compiled
-def arc_scores(ridge, usual, bend_cost, state, bends, scores):
-    """Fill in the strength of the ridge along each of many arcs ahead, as a share of the usual, less its price."""
+@compiled_inner
+def best_arc(ridge, usual, state):
+    """Return the curvature of the arc ahead that follows the ridge best.
+
+    An arc's score is the strength of the ridge along it, as a share of the usual, less the price of its bend.
+    """
     strength, noise = ridge.strength, ridge.noise
     u, v, angle, bend = state
     ahead, beside = STEP_PX * math.cos(angle), STEP_PX * math.sin(angle)
-    for index in range(len(bends)):
-        tried = bends[index]
+    bend_cost = 1.1 * (1.0 + 2.0 * (ridge.faintest / usual) ** 2)  # for 1 / px; higher where the thread is faint
+    best, best_score = bend, -np.inf
+    for index in range(BENDS):
+        part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
+        tried = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
         # The arc as chords: each is the last one turned by the same angle, the first by half of it.
         x, y = u, v
         half, half_sine = math.cos(0.5 * tried * STEP_PX), math.sin(0.5 * tried * STEP_PX)
@@ -105,22 +111,13 @@ def arc_scores(ridge, usual, bend_cost, state, bends, scores):
             share = 1.0 if step < 5 else 0.6
             score += share * value
             weight += share
-        scores[index] = score / weight - bend_cost * abs(tried - bend) - 0.15 * abs(tried)
+        score = score / weight - bend_cost * abs(tried - bend) - 0.15 * abs(tried)
+        if score > best_score:
+            best, best_score = tried, score
+    return best
 
 
-@compiled
-def best_arc(ridge, usual, state, bends, scores):
-    """Return the curvature of the arc ahead that follows the ridge best."""
-    bend = state[3]
-    bend_cost = 1.1 * (1.0 + 2.0 * (ridge.faintest / usual) ** 2)  # for 1 / px; higher where the thread is faint
-    for index in range(BENDS):
-        part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
-        bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
-    arc_scores(ridge, usual, bend_cost, state, bends, scores)
-    return bends[scores.argmax()]
-
-
-@compiled
+@compiled_inner
 def centred(ridge, u, v, angle, max_shift):
     """Return how far aside the ridge's middle lies, at most `max_shift`, and the strength there."""
     strength, noise = ridge.strength, ridge.noise
@@ -139,7 +136,7 @@ def centred(ridge, u, v, angle, max_shift):
     return shift, sample(strength, u + shift * x, v + shift * y) - noise
 
 
-@compiled
+@compiled_uncounted
 def walk_on(ridge, dish, max_length, path, strong, count):
     """Walk along a ridge from a path's last vertex to the ridge's end.
 
@@ -155,11 +152,11 @@ def walk_on(ridge, dish, max_length, path, strong, count):
         The number of vertices.
     """
     faintest = ridge.faintest
-    u, v, angle, bend, usual, length = path[count - 1]
-    bends, scores = np.empty(BENDS), np.empty(BENDS)
+    u, v, angle = path[count - 1, 0], path[count - 1, 1], path[count - 1, 2]
+    bend, usual, length = path[count - 1, 3], path[count - 1, 4], path[count - 1, 5]
     gap, last = 0.0, count
     while length < max_length and gap < 13.0 and count < len(path):  # px; a gap is crossed
-        bend_ahead = best_arc(ridge, usual, (u, v, angle, bend), bends, scores)
+        bend_ahead = best_arc(ridge, usual, (u, v, angle, bend))
         if gap > 0.0:
             bend_ahead = 0.5 * (bend_ahead + bend)
         halfway = angle + 0.5 * bend_ahead * STEP_PX
@@ -207,7 +204,7 @@ def refine(ridge, points, strong):
         points[index, 1] += even * math.cos(angles[index])
 
 
-@compiled
+@compiled_inner
 def ways_out(ridge, tail, max_hidden, ways):
     """Find the arcs along which a thread may leave the tail.
 
@@ -215,33 +212,32 @@ def ways_out(ridge, tail, max_hidden, ways):
         ridge: see `Ridge`.
         tail: u, v and the needle's direction there [px, px, rad].
         max_hidden: of a way, at most [px].
-        ways: filled with angle, curvature, length up to where it can be seen, strength, score and greatest turn, the
-            best first, shape (most, 6).
+        ways: filled with angle, curvature, length up to where it can be seen, strength, score, greatest turn, and the
+            place where it ends, u and v, the best first, shape (most, 8).
 
     Returns:
         How many there are.
     """
     count = 0
-    ends = [(0.0, 0.0)] * len(ways)
     for index in range(90):
         angle = 2.0 * math.pi * index / 90
         for side in (-1.0, 1.0):
             for bend in (0.0, 0.04, 0.08, 0.12):
                 if side * bend == 0.0 and side > 0.0:
                     continue  # tried already
-                count = _try(ridge, tail, (angle, side * bend, math.pi), max_hidden, ways, ends, count)
+                count = _try(ridge, tail, (angle, side * bend, math.pi), max_hidden, ways, count)
             for bend in (0.17, 0.23, 0.31, 0.42):  # after a sharp bend the thread goes straight on
                 for turn in (math.pi, 0.75 * math.pi):
-                    count = _try(ridge, tail, (angle, side * bend, turn), max_hidden, ways, ends, count)
+                    count = _try(ridge, tail, (angle, side * bend, turn), max_hidden, ways, count)
     for index in range(181):  # below the needle
         for bend in (0.0, 0.005, -0.005):
             arc = (tail[2] + math.radians(75.0) * (2.0 * index / 180 - 1.0), bend, math.pi)
-            count = _try(ridge, tail, arc, max_hidden, ways, ends, count)
+            count = _try(ridge, tail, arc, max_hidden, ways, count)
     return count
 
 
-@compiled
-def _try(ridge, tail, arc, max_hidden, ways, ends, count):
+@compiled_inner
+def _try(ridge, tail, arc, max_hidden, ways, count):
     """Enter an arc among the best, in their order, unless a better one ends nearby; return how many there are."""
     angle, bend, most = arc
     faintest = ridge.faintest
@@ -282,12 +278,12 @@ def _try(ridge, tail, arc, max_hidden, ways, ends, count):
         return count
     place = 0
     while place < count and ways[place, 4] >= score:
-        if math.hypot(ends[place][0] - u, ends[place][1] - v) < 8.0:
+        if math.hypot(ways[place, 6] - u, ways[place, 7] - v) < 8.0:
             return count
         place += 1
     # A worse one that ends nearby makes room, else the last.
     last = place
-    while last < count and math.hypot(ends[last][0] - u, ends[last][1] - v) >= 8.0:
+    while last < count and math.hypot(ways[last, 6] - u, ways[last, 7] - v) >= 8.0:
         last += 1
     if last == count:
         if count < len(ways):
@@ -296,22 +292,23 @@ def _try(ridge, tail, arc, max_hidden, ways, ends, count):
             return count
         last = count - 1
     for index in range(last, place, -1):
-        ways[index], ends[index] = ways[index - 1], ends[index - 1]
+        for column in range(ways.shape[1]):
+            ways[index, column] = ways[index - 1, column]
     ways[place, 0], ways[place, 1], ways[place, 2] = angle, bend, first
     ways[place, 3], ways[place, 4], ways[place, 5] = strength, score, most
-    ends[place] = (u, v)
+    ways[place, 6], ways[place, 7] = u, v
     return count
 
 
-@compiled
+@compiled_inner
 def begin_path(ridge, tail, way, path, strong):
     """Begin a path along a way out, up to where the thread can be seen; see `walk_on`.
 
     Returns:
         The number of vertices.
     """
-    path[0, :] = 0.0
-    path[0, 0], path[0, 1], strong[0] = tail[0], tail[1], False
+    path[0, 0], path[0, 1], path[0, 2] = tail[0], tail[1], 0.0
+    path[0, 3], path[0, 4], path[0, 5], strong[0] = 0.0, 0.0, 0.0, False
     u, v, s, turned, step, count = tail[0], tail[1], 0.0, 0.0, 3.0, 1
     until = max(way[2], 3.0)
     if abs(way[1]) > 0.1:  # A small bend is laid as a whole: the walk does not turn as sharply.
@@ -332,7 +329,7 @@ def begin_path(ridge, tail, way, path, strong):
     return count
 
 
-@compiled
+@compiled_uncounted
 def worth(path, strong, count):
     """Return how much thread a path shows, none of it twice [px], less its unsteadiness."""
     value = 0.0
@@ -367,10 +364,10 @@ def follow(ridge, start, dish, max_length, max_hidden, path, strong):
     Returns:
         The number of vertices.
     """
-    ways = np.empty((5, 6))
+    ways = np.empty((5, 8))
     found = ways_out(ridge, start, max_hidden, ways)
-    path[0, :] = 0.0
-    path[0, :2], strong[0] = start[:2], False
+    path[0, 0], path[0, 1], path[0, 2] = start[0], start[1], 0.0
+    path[0, 3], path[0, 4], path[0, 5], strong[0] = 0.0, 0.0, 0.0, False
     best, best_value, enough = 1, 0.0, 0.9 * max_length  # so much thread needs no other way
     other, other_strong = np.empty_like(path), np.empty_like(strong)
     for index in range(found):
@@ -379,7 +376,10 @@ def follow(ridge, start, dish, max_length, max_hidden, path, strong):
         value = worth(other, other_strong, count)
         if value > 1.25 * best_value + (8.0 if index > 0 else 0.0):  # px; the first begins strongest
             best, best_value = count, value
-            path[:count], strong[:count] = other[:count], other_strong[:count]
+            for vertex in range(count):
+                strong[vertex] = other_strong[vertex]
+                for column in range(path.shape[1]):
+                    path[vertex, column] = other[vertex, column]
         if best_value > enough:
             break
     return best

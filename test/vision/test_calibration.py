@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import tilted
-from benchmarks.vision.photographs import DIAMETER, photo_of
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.settings.parameter_files import load_setup
 from magnetosuture_thread.vision.calibration import (
@@ -52,22 +50,6 @@ def test_by_the_dish_the_mean_over_frames_is_taken():
     assert found.view.metres_per_pixel == pytest.approx(8e-5, rel=5e-3)
     assert found.frames == 3
     assert found.scatter_px < 0.2
-
-
-@pytest.mark.parametrize("name", ["photo_on_cloth", "photo_blood", "photo_yellow"])
-def test_the_tracker_and_the_calibration_find_the_same_dishes(name: str):
-    for index in range(3):
-        image = photo_of(name, index, 41).image
-        track = VisionTracker(VisionTrackerSettings(), Scene(dish=Dish(DIAMETER))).look(image)
-        seen = track.view
-        if seen is None:
-            with pytest.raises(InvalidInputError, match="0 of 1 with a dish"):
-                calibrate_by_dish([image], DIAMETER)
-        else:
-            found = calibrate_by_dish([image], DIAMETER)
-            assert found.view.centre_px == pytest.approx(seen.centre_px, abs=0.01)
-            assert found.view.metres_per_pixel == pytest.approx(seen.metres_per_pixel, rel=1e-4)
-            assert found.scale_error == track.scale_error > 0.0
 
 
 def test_what_is_not_sure_of_a_calibration_is_said(tmp_path: Path):

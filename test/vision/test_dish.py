@@ -10,10 +10,8 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.vision.dish import (
     LONG_SEARCH,
-    RIM_RAYS,
     DishWatch,
     find_dish,
-    rim_shift,
     see_dish,
 )
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -45,23 +43,13 @@ def test_a_hand_over_a_third_of_the_rim_does_not_move_the_dish():
     assert found.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)
 
 
-def test_the_quick_check_tells_how_far_the_rim_has_moved():
-    gray = gray_of((322.0, 238.0), 8e-5, 3)
-    radius = 0.0175 / 8e-5
-    assert rim_shift(gray, (322.0, 238.0), radius)[0] < 0.2
-    shift, rays = rim_shift(gray, (324.0, 236.0), radius)
-    assert shift == pytest.approx(np.hypot(2.0, 2.0), abs=0.4)
-    assert rays > 0.8 * RIM_RAYS
-    assert rim_shift(0 * gray, (322.0, 238.0), radius)[1] == 0
-
-
 def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
     bright = np.full((480, 640), 225, np.uint8)
     cv2.circle(bright, (322, 238), 200, 255, -1, cv2.LINE_AA)  # too little contrast for a rim
     assert see_dish(bright, VisionTrackerSettings(), 0.035, photographed=False) is None
     watch = DishWatch(VisionTrackerSettings(), 0.035)
     assert watch.look(bright)[0] == ""  # in the first frame at once
-    watch.forget()
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
     for _ in range(2):
         assert watch.look(0 * bright)[0] != ""
     reasons = [watch.look(bright)[0] for _ in range(LONG_SEARCH)]

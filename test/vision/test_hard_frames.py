@@ -29,7 +29,8 @@ LIMITS: dict[str, tuple[int, float, float]] = {
     },
     **{f"thread_{name}": (FRAMES, 0.95, 0.02) for name in THREADS},
     **{f"wall_{end}": (FRAMES - 1, 0.7, 0.02) for end in ("tip", "tail", "side")},
-    **{name: (FRAMES, 0.95, 0.01) for name in ("width_320", "width_1280", "width_1920", "dark_field", "blunt_rod")},
+    **{f"width_{columns}": (FRAMES, 0.95, 0.01) for columns in (320, 1280, 1920)},
+    **{name: (FRAMES, 0.95, 0.01) for name in ("usual", "saturated", "dark_field", "blunt_rod")},
     **{
         name: (FRAMES - 1, 0.7, 0.02) for name in ("length_off_2", "length_off_5", "suture_needle", "instrument_beside")
     },

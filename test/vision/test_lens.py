@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from benchmarks.vision.frames import distorted, lens_with
-from benchmarks.vision.measurements import frame_of, measure
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -50,14 +49,6 @@ def test_what_the_lens_does_is_undone(model: str):
     middle = np.s_[100:380, 100:540]
     assert np.abs(seen[middle].astype(int) - pattern[middle]).max() > 20
     assert np.abs(lens.undistorted(seen)[middle].astype(int) - pattern[middle]).max() <= 6
-
-
-def test_with_its_lens_a_distorted_frame_is_measured_as_well_as_one_without():
-    for index in range(3):
-        result = measure(*frame_of("distortion", index, 31))
-        assert result.found
-        assert result.honest
-        assert result.tail_px < 0.6
 
 
 def test_in_large_frames_the_lens_is_shrunk_with_them():
@@ -100,13 +91,6 @@ def test_a_lens_of_another_size_is_warned_of_and_not_used_with_a_needle_and_with
     found = tracker.look(render(Pose(np.array([0.5, 0.5]), 0.3)))
     assert found.reason.startswith("no needle")
     assert found.warning == warning
-
-
-def test_a_scale_that_does_not_fit_the_dish_is_warned_of_without_a_needle_too():
-    settings = VisionTrackerSettings(metres_per_pixel=1.06 * VIEW.metres_per_pixel)
-    found = VisionTracker(settings, SCENE).look(render(Pose(np.array([0.5, 0.5]), 0.3)))
-    assert found.reason.startswith("no needle")
-    assert found.warning.startswith("metres_per_pixel, which is used, is 6% off the dish's diameter")
 
 
 def test_the_doubt_of_a_calibrated_scale_is_stated():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -75,16 +74,6 @@ def test_it_follows_the_line_to_its_end_and_no_farther(noise: float, level: int)
     np.testing.assert_array_equal(found[0], NEEDLE.tail_px)
 
 
-@pytest.mark.parametrize("width", [3, 6, 8, 10])
-@pytest.mark.parametrize("level", [140, 80])
-def test_a_thread_wider_than_the_needle_is_followed_to_its_end(width: int, level: int):
-    image = drawn(wave(), width=width, level=level, needle=7)
-    found = walk(image, max_length=1.05 * arc_lengths(wave())[-1], needle=replace(NEEDLE, width_px=7.0))
-    mean, share = line_error(found, wave())
-    assert mean < 0.8
-    assert share > 0.97
-
-
 def test_it_stops_at_the_longest_length_and_at_the_wall():
     assert walk(drawn(wave()), max_length=60.0)[-1, 0] > 240.0
     near_wall = walk(drawn(wave()), reach=100.0)
@@ -102,14 +91,6 @@ def test_the_thread_may_leave_the_tail_at_any_angle_but_the_needles(angle: float
     line = winding(np.full(100, angle) + 0.4 * np.linspace(0.0, 1.0, 100), length=120.0)
     found = walk(drawn(line))
     assert np.linalg.norm(found[-1] - line[-1]) < 5.0
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize("radius", [30.0, 16.0])
-def test_the_walk_goes_straight_through_its_own_crossing(sign: float, radius: float):
-    turned = np.clip((np.linspace(0.0, 237.0, 800) - 50.0) / radius, 0.0, 1.6 * np.pi)
-    line = winding(np.pi + sign * turned)
-    check_order(walk(drawn(line), max_length=250.0), line)
 
 
 def test_a_near_pass_beside_an_earlier_part_does_not_capture_it():
@@ -208,14 +189,6 @@ def order_of(*pieces: tuple[np.ndarray, tuple[int, int]], longest: float = 260.0
     """Return the order of pieces, given with the areas that their ends run into."""
     lines, areas = zip(*pieces, strict=True)
     return find_order(list(lines), list(areas), bare_dish(), (0.92 * longest, longest), SCALE)
-
-
-def test_the_straight_way_below_a_cover_is_taken():
-    first, second = order_of(TAIL, (line((330.0, 200.0), (251.0, 200.0)), (0, 1)))
-    assert (first.index, first.turned, second.index, second.turned) == (0, False, 1, True)
-    low, high = second.arc_length
-    assert low == pytest.approx(69.0 + 102.0)
-    assert low < high <= 260.0 - 79.0 + 1e-9
 
 
 def test_an_order_that_ends_in_sight_and_is_too_short_is_not_told():
