@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -24,9 +24,6 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.interface import Channel, Quality
 from magnetosuture_thread.settings.untrusted import MAX_BLOCK_BYTES
-
-if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.node import GuardedNode
 
 QUALITIES = {
     Quality.SENSOR: qos_profile_sensor_data,
@@ -52,6 +49,13 @@ MAX_BYTES = {
     **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
 }
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
+
+
+class Subscriber(Protocol):
+    """A node that reports messages that are refused."""
+
+    create_subscription: Callable[..., Subscription]
+    refuse: Callable[[Exception], None]
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,7 @@ class Topic:
             expected = f"a {self.channel.type_name} of our definition"
             raise InvalidInputError(self.channel.name, f"{len(data)} bytes", expected) from None
 
-    def subscribe(self, node: GuardedNode, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
+    def subscribe(self, node: Subscriber, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         What comes is bytes: what is too large is not made into a message first.
@@ -117,7 +121,7 @@ class Topic:
             self.message, self.name, take, copy(self.qos), qos_overriding_options=options, raw=True
         )
 
-    def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
+    def subscribe_numbered(self, node: Subscriber, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
 
         Where the middleware does not number messages, all that tells is how many publishers there are: of
@@ -137,7 +141,7 @@ class Topic:
         subscription = self.subscribe(node, take, raw=True)
         return subscription
 
-    def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+    def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> None:
         """Call back with the message of some bytes; where they are none, the node reports that they are refused."""
         try:
             message = self.decode(data)

@@ -21,7 +21,7 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import console as console_graph
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import joined
+from magnetosuture_thread.nodes.clients import Participant
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
@@ -35,8 +35,8 @@ SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.
 @pytest.fixture
 def node(graph) -> Iterator[Node]:
     """The console's node, in the graph of the test."""
-    with joined(domain=graph.domain) as made:
-        yield made
+    with Participant("console", domain=graph.domain) as made:
+        yield made.node
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.nodes.run import Interruption
+from magnetosuture_thread.nodes.processes import Interruption
 
 
 @pytest.fixture
