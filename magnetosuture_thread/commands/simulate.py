@@ -264,7 +264,8 @@ class _Procedure:
             self.result["min_clearance_m"] = finite_or_none(status.clearance)
         for report in (status, result):
             if report is not None:
-                self.result |= {"state": report.state, "reason": report.reason, "goals_met": report.goals_met}
+                state = clients.procedure_state(report)
+                self.result |= {"state": state, "reason": report.reason, "goals_met": report.goals_met}
         self.ended = result is not None
 
     def fail(self, reason: str) -> str:

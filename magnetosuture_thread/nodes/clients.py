@@ -12,7 +12,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,6 +22,7 @@ from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
 from rclpy.action import ActionClient
 from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -119,7 +119,8 @@ def listen(
     def received(data: bytes, info: Any) -> None:  # rclpy counts the arguments of a callback
         take(bytes(data), info)
 
-    return node.create_subscription(topic.message, topic.name, received, quality, raw=True)
+    events = SubscriptionEventCallbacks(use_default_callbacks=False)  # each would be waited for in each turn
+    return node.create_subscription(topic.message, topic.name, received, quality, raw=True, event_callbacks=events)
 
 
 class Inbox:
@@ -389,27 +390,9 @@ def _listed(texts: Any) -> str:
     return shortened("; ".join(texts), MAX_REASON_CHARS)
 
 
-@dataclass(frozen=True)
-class ProcedureReport:
-    """What the planner reports of a procedure.
-
-    Attributes:
-        state: planned, running, paused, done or failed; unknown where there is none.
-        reason: why it is paused or has failed; empty else.
-        goals_met: how many goals are met.
-        progress: completed share of the present goal's path, 0 to 1.
-        clearance: minimum distance of the needle's axis from wall and shapes so far [m]; NaN if unknown.
-    """
-
-    state: str
-    reason: str
-    goals_met: int
-    progress: float = 0.0
-    clearance: float = math.nan
-
-
-def _state_name(state: int) -> str:
-    name = constant_name(ProcedureState, state, "STATE_")
+def procedure_state(message: Any) -> str:
+    """Return the state of a procedure, or of its result: planned, running, paused, done or failed; unknown if none."""
+    name = constant_name(ProcedureState, message.state, "STATE_")
     return {"ready": "planned", "idle": "unknown"}.get(name, name)
 
 
@@ -430,8 +413,8 @@ class ProcedureClient:
         self._request = ExecuteProcedure.Goal(procedure=procedure)
         self._send_at: float | None = None  # None until the planner is found, infinite while it executes the goal
         self._client = ActionClient(node, ExecuteProcedure, EXECUTE_PROCEDURE)
-        self.status: ProcedureReport | None = None
-        self.result: ProcedureReport | None = None
+        self.status: ProcedureState | None = None
+        self.result: ExecuteProcedure.Result | None = None
         self.refusal = ""
 
     def poll(self) -> None:
@@ -446,14 +429,12 @@ class ProcedureClient:
             sent.add_done_callback(lambda sent: sent.result().get_result_async().add_done_callback(self._on_result))
 
     def _on_feedback(self, message: Any) -> None:
-        status = message.feedback.status
-        figures = status.goals_met, status.progress, status.clearance
-        self.status = ProcedureReport(_state_name(status.state), status.reason, *figures)
+        self.status = message.feedback.status
 
     def _on_result(self, ended: Future) -> None:
         result = ended.result().result
         if self.status is not None or result.state == ProcedureState.STATE_DONE:
-            self.result = ProcedureReport(_state_name(result.state), result.reason, result.goals_met)
+            self.result = result
         else:
             self.refusal, self._send_at = result.reason, time.monotonic() + 2.0  # s; then it is sent again
 
@@ -495,9 +476,9 @@ class Recorder(Participant):
     def spin(self, duration: float) -> None:
         """Receive messages for a time [s]."""
         end = time.monotonic() + duration
-        while time.monotonic() < end:
+        while (left := end - time.monotonic()) > 0.0:
             self.spin_some()
-            time.sleep(POLL_PERIOD)
+            time.sleep(min(left, 2.0 * POLL_PERIOD))
 
     def _take(self, topic: topics.Topic, data: bytes, info: Any) -> None:
         now = self.node.get_clock().now().nanoseconds if self._is_simulated else info["received_timestamp"]

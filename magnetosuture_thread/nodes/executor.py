@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack, suppress
 from typing import Any
 
@@ -92,7 +92,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
             if self._changed and entity not in self._entities["guard_condition"].values():  # which are ready once
                 break
             if (execute := take(entity)) is not None:
-                self._run(Task(execute, executor=self))
+                self._begin(execute())
         return resumed or bool(ready)
 
     def _gather(self) -> None:
@@ -101,13 +101,11 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         self._held.close()
         self._held.enter_context(self._context.handle)
         nodes = self.get_nodes()
-        entities: dict[str, list[Any]] = {
-            "guard_condition": [self._guard, self._sigint_gc, *(each for node in nodes for each in node.guards)],
-            "timer": [each for node in nodes for each in node.timers],
-            "subscription": [each for node in nodes for each in node.subscriptions],
-            "client": [each for node in nodes for each in node.clients],
-            "service": [each for node in nodes for each in node.services],
+        entities = {
+            "guard_condition": [self._guard, self._sigint_gc, *(each for node in nodes for each in node.guards)]
         }
+        for kind in ("timer", "subscription", "client", "service"):
+            entities[kind] = [each for node in nodes for each in getattr(node, f"{kind}s")]
         self._entities = {
             kind: {each.handle.pointer: each for each in every if self._hold(each.handle)}
             for kind, every in entities.items()
@@ -117,15 +115,9 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         count = NumberOfEntities(subscriptions, guards, timers, clients, services)
         for waitable in self._waitables:
             count += waitable.get_num_entities()
-        self._wait_set = rclpy_implementation.WaitSet(
-            count.num_subscriptions,
-            count.num_guard_conditions,
-            count.num_timers,
-            count.num_clients,
-            count.num_services,
-            count.num_events,
-            self._context.handle,
-        )
+        kinds = ("subscription", "guard_condition", "timer", "client", "service", "event")
+        numbers = (getattr(count, f"num_{kind}s") for kind in kinds)
+        self._wait_set = rclpy_implementation.WaitSet(*numbers, self._context.handle)
 
     def _hold(self, handle: Any) -> bool:
         with suppress(rclpy_implementation.InvalidHandle):  # it was destroyed by another thread
@@ -146,20 +138,25 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
             if waitable.is_ready(self._wait_set):
                 yield self._take_waitable, waitable
 
+    def _begin(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine until it ends or awaits; most end, and need no task."""
+        try:
+            coroutine.send(None)
+        except StopIteration:
+            return
+        with self._tasks_lock:
+            self._tasks.append((Task(coroutine, executor=self), None, None))
+
     def _resume_tasks(self) -> bool:
         """Begin or resume tasks; return whether one has ended, for which others may wait."""
         with self._tasks_lock:
-            tasks = list(self._tasks)
-            self._tasks.clear()
-        for task, *_ in tasks:
-            self._run(task)
-        return any(task.done() for task, *_ in tasks)
-
-    def _run(self, task: Task) -> None:
-        """Run a task, until it ends or awaits; raise what it raises."""
-        task()
-        if not task.done() and not task.cancelled():
+            tasks = [task for task, *_ in self._tasks]
+        try:
+            for task in tasks:
+                task()
+                if (error := task.exception()) is not None:
+                    raise error
+        finally:
             with self._tasks_lock:
-                self._tasks.append((task, None, None))
-        elif (error := task.exception()) is not None:
-            raise error
+                self._tasks[:] = [each for each in self._tasks if not (each[0].done() or each[0].cancelled())]
+        return any(task.done() for task in tasks)

@@ -34,20 +34,15 @@ QUALITIES = {
         depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
     ),
 }
-# Bytes that a message may have, by its type or package; what is larger is not even decoded.
+# Bytes that a message may have, by the package of its type; what is larger is not even decoded. What is read often, or
+# by a person's page, has little; a scene of the most shapes has 120 kB.
 MAX_BYTES = {
-    "sensor_msgs/msg/CameraInfo": 1 << 16,
-    "magnetosuture_msgs/msg/Scene": 1 << 17,  # the largest has 120 kB
-    "magnetosuture_msgs/msg/ThreadMaterial": 1 << 18,
-    **{
-        f"magnetosuture_msgs/msg/{name}": 1 << 16
-        for name in ("TrackerState", "FilterState", "CoilBridgeState", "ProcedureState", "CoilCurrents")
-    },
+    **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
     "diagnostic_msgs": 1 << 16,
     "sensor_msgs": MAX_BLOCK_BYTES,
     "visualization_msgs": 1 << 22,
-    **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
 }
+MAX_OTHER_BYTES = 1 << 19
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 
 
@@ -77,8 +72,7 @@ class Topic:
     @property
     def max_bytes(self) -> int:
         """Return how many bytes a message may have."""
-        kind = self.channel.type_name
-        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], 1 << 19)
+        return MAX_BYTES.get(self.channel.type_name.partition("/")[0], MAX_OTHER_BYTES)
 
     @property
     def message(self) -> Any:

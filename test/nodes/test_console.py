@@ -23,10 +23,9 @@ from magnetosuture_thread.nodes import console as console_graph
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Participant
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.nodes.console import ConsoleGraph, GraphHost
+from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
-from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from test.nodes import wire
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
@@ -181,22 +180,6 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     shown = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     assert np.abs(shown.astype(int) - pixels).max() < 12
-
-
-def test_a_rig_is_paused_where_there_is_one(graph, console):
-    host = GraphHost(console)
-    assert not host.state()["can_pause"]
-    assert "no node of this graph" in asyncio.run(host.set_paused(True))
-    rig = graph.add(RigSimulatorNode, **SMALL)
-    graph.wait(lambda: host.state()["can_pause"] and host.state()["simulated"], "the rig")
-    assert asyncio.run(host.set_paused(True)) == ""
-    assert host.state()["paused"]
-    assert rig.time.paused
-    assert asyncio.run(host.set_paused(False)) == ""
-    assert not host.state()["paused"]
-    assert not rig.time.paused
-    assert "not started from the page" in asyncio.run(host.select_setup("petri_150mm_silk"))
-    assert "--graph" in asyncio.run(host.set_recording(True, "an operator"))
 
 
 def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, console):
