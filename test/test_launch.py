@@ -9,7 +9,6 @@ import re
 import shlex
 import subprocess
 import sys
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -115,29 +114,6 @@ def test_lifecycle_nodes_alone_go_as_far_as_autostart_says(description, planner:
         for parameters in node.parameters[1:]:
             given |= parameters
         assert given.get("autostart") == ("inactive" if node.executable in LIFECYCLE else None)
-
-
-@pytest.mark.parametrize(
-    ("pushed", "namespace", "outer"),
-    [("", "", ""), ("/lab", "/left", "/left"), ("/lab", "left", "/lab/left")],
-)
-def test_enclaves_have_the_names_of_processes_below_their_namespace(
-    description, monkeypatch: pytest.MonkeyPatch, pushed: str, namespace: str, outer: str
-):
-    monkeypatch.setitem(Context.launch_configurations, "ros_namespace", pushed)
-    monkeypatch.setitem(INSTALLED, "tf2_ros", "/opt/ros/jazzy")
-    policies = ElementTree.parse(ROOT / "config" / "security" / "policies.xml").getroot()
-    enclaves = {f"{outer}{enclave.get('path')}" for enclave in policies.iter("enclave")}
-    started = [
-        node
-        for planner in ("true", "false")
-        for node in nodes(description, namespace=namespace, planner=planner, enclaves="true")
-    ]
-    for node in started:
-        name = "dish_transform" if node.package == "tf2_ros" else node.executable
-        assert node.ros_arguments == ["--enclave", f"{outer}/{name}"]
-        assert node.ros_arguments[1] in enclaves
-    assert all(node.ros_arguments == [] for node in nodes(description, namespace=namespace))
 
 
 @pytest.mark.parametrize(("prefix", "remapped"), [("", [("/tf_static", "tf_static")]), ("left/", [])])

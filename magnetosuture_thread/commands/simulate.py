@@ -151,7 +151,9 @@ def simulate(
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
     if problem:
-        raise GraphError(f"{problem}; what was recorded is in {output}")
+        if task.result is None:
+            raise GraphError(f"{problem}; what was recorded is in {output}")
+        task.result |= {"state": "failed" if task.stage else task.result["state"], "reason": problem}
     log("evaluating the run")
     figures = {"setup": setup.name, "procedure": task.result}
     try:
@@ -216,10 +218,6 @@ class _Path:
         self.share = float(values.get("progress", 0.0))
         self.ended = state == "done" and self._duration is None
 
-    def fail(self, reason: str) -> str:
-        """Return what to report of a run that ends for a reason."""
-        return reason
-
     def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
         """Return what to report of a run that does not end."""
         states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.status_texts.items()))
@@ -268,18 +266,12 @@ class _Procedure:
                 self.result |= {"state": state, "reason": report.reason, "goals_met": report.goals_met}
         self.ended = result is not None
 
-    def fail(self, reason: str) -> str:
-        """Register why the run ends; return nothing, as the reason is in the result."""
-        self.result |= {"state": "failed", "reason": reason}
-        return ""
-
     def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
-        """Register that the run does not end; return nothing."""
+        """Return what to report of a run that does not end."""
         if self.stage == 0:
-            self.result["reason"] = (self._client and self._client.refusal) or "no needle planner"
-            return ""
+            return (self._client and self._client.refusal) or "no needle planner"
         reason = f": {self.result['reason']}" if self.result["reason"] else ""
-        return self.fail(f"{self.result['state']} after {elapsed:.0f} s{reason}")
+        return f"{self.result['state']} after {elapsed:.0f} s{reason}"
 
 
 @dataclass
@@ -347,7 +339,7 @@ class _Run:
             fault = recorder.status_texts.get("coil_bridge", ("", {}))[0]
             if task.ended or fault.startswith("fault: "):  # after which the needle rests for good
                 recorder.spin(0.5 / rate)
-                return "" if task.ended else task.fail(f"coil_bridge: {fault}")
+                return "" if task.ended else f"coil_bridge: {fault}"
             if duration is not None and stage and elapsed > duration + (EXTRA_TIME if stage == 1 else 0.0):
                 return ""
             if elapsed > (task.time_limit if stage else live.START_TIMEOUT):

@@ -374,6 +374,8 @@ def main(arguments: list[str] | None = None) -> int:
         for which in end_signals():  # a second one must not interrupt what follows
             signal.signal(which, signal.SIG_IGN)
         if node is not None:
+            if node.executor is not None:
+                node.executor.shutdown()
             node.destroy_node()
         rclpy.try_shutdown()
     return 0

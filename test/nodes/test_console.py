@@ -44,16 +44,6 @@ def console(node: Node) -> ConsoleGraph:
     return ConsoleGraph(node, ConsoleSettings())
 
 
-def act(console: ConsoleGraph, action: str) -> str:
-    """Press a switch."""
-    return asyncio.run(console.execute_action(action))
-
-
-def bridge(console: ConsoleGraph) -> dict:
-    """Return what the page knows of the bridge, or nothing."""
-    return console.state()["bridge"] or {}
-
-
 def tell(graph, topic: topics.Topic, message, until: Callable[[], object], what: str) -> None:
     """Say something again and again until the page knows; what was said before it was found is lost."""
 
@@ -62,25 +52,6 @@ def tell(graph, topic: topics.Topic, message, until: Callable[[], object], what:
         return bool(until())
 
     graph.wait(told, what)
-
-
-def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
-    graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
-    graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
-    assert not bridge(console)["armed"]
-    assert act(console, "arm") == ""
-    graph.wait(lambda: bridge(console)["armed"], "the bridge to be armed")
-    assert act(console, "disarm") == ""
-    graph.wait(lambda: not bridge(console)["armed"], "the bridge to be disarmed")
-    assert act(console, "arm") == ""
-    assert act(console, "stop") == ""
-    graph.wait(lambda: bridge(console)["emergency_stopped"], "the emergency stop")
-    assert bridge(console)["state"] == "fault"
-    assert "emergency stop" in act(console, "arm")
-    assert act(console, "reset") == ""
-    graph.wait(lambda: bridge(console)["state"] == "active", "the bridge to be active again")
-    assert not bridge(console)["armed"]
-    assert "expected one of arm, disarm, stop, reset" in act(console, "dance")
 
 
 def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):

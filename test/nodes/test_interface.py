@@ -17,12 +17,9 @@ from rclpy.qos import DurabilityPolicy
 
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import CoilClient
-from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.settings import interface
-from magnetosuture_thread.settings.errors import GraphError
 from test.nodes.conftest import Graph
 from test.nodes.makers import EVERY_NODE
 
@@ -166,18 +163,6 @@ def test_the_page_has_on_the_graph_what_its_policies_allow_and_no_more(graph: Gr
     node.health.ok("serving")
     ConsoleGraph(node, ConsoleSettings())
     check(graph, "console")
-
-
-def test_the_command_coils_has_on_the_graph_what_its_policies_allow_and_no_more(
-    graph: Graph, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-    graph.add(CoilBridgeNode, scene="dish_35mm", autostart="active")
-    with CoilClient() as client:
-        for action in ("arm", "stop", "reset", "deactivate"):
-            with suppress(GraphError):
-                client.execute(action)
-        check(graph, "coil_client")
 
 
 def test_who_may_move_the_needle_arm_stop_or_change_the_scene():
