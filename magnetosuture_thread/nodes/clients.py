@@ -22,7 +22,6 @@ from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
 from rclpy.action import ActionClient
 from rclpy.context import Context
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -119,8 +118,7 @@ def listen(
     def received(data: bytes, info: Any) -> None:  # rclpy counts the arguments of a callback
         take(bytes(data), info)
 
-    events = SubscriptionEventCallbacks(use_default_callbacks=False)  # each would be waited for in each turn
-    return node.create_subscription(topic.message, topic.name, received, quality, raw=True, event_callbacks=events)
+    return node.create_subscription(topic.message, topic.name, received, quality, raw=True)
 
 
 class Inbox:

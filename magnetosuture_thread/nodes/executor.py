@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack, suppress
 from typing import Any
 
+from rclpy.event_handler import EventHandler
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.waitable import NumberOfEntities
+
+EVENT_PERIOD = 1.0  # s between two looks at events, as that a publisher of another quality of service was found
 
 
 class KeptWaitSetExecutor(SingleThreadedExecutor):
@@ -19,7 +23,8 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
     rclpy gathers all entities of all nodes anew for each callback, and wakes itself twice by each. Here they are
     gathered when a node tells of a change, as rclpy's nodes do. A turn calls each entity that is ready once. Where a
     callback adds or removes an entity, the others are still ready in the next turn. A callback that awaits is resumed
-    in each turn, and holds nobody else of its callback group off.
+    in each turn, and holds nobody else of its callback group off. Events, of which rclpy makes some for each publisher
+    and subscription, are looked at once a second only.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -28,6 +33,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         self._wait_set: Any = None
         self._entities: dict[str, dict[int, Any]] = {}  # of each kind, by pointer
         self._waitables: list[Any] = []
+        self._events_due = 0.0
         super().__init__(**options)
 
     def wake(self) -> None:
@@ -82,12 +88,16 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
             add = getattr(self._wait_set, f"add_{kind}")
             for entity in entities.values():
                 add(entity.handle)
-        for waitable in self._waitables:
+        now = time.monotonic()
+        with_events = now >= self._events_due
+        waitables = [each for each in self._waitables if with_events or not isinstance(each, EventHandler)]
+        for waitable in waitables:
             waitable.add_to_wait_set(self._wait_set)
+        self._events_due = now + EVENT_PERIOD if with_events else self._events_due
         self._wait_set.wait(0 if resumed else nanoseconds)
         if not self._context.ok():
             raise ExternalShutdownException()
-        ready = [] if self._is_shutdown else list(self._ready())
+        ready = [] if self._is_shutdown else list(self._ready(waitables))
         for take, entity in ready:
             if self._changed and entity not in self._entities["guard_condition"].values():  # which are ready once
                 break
@@ -125,7 +135,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
             return True
         return False
 
-    def _ready(self) -> Iterator[tuple[Callable[[Any], Any], Any]]:
+    def _ready(self, waitables: list[Any]) -> Iterator[tuple[Callable[[Any], Any], Any]]:
         """Yield each entity that is ready, after the method of rclpy that takes its data."""
         for kind, entities in self._entities.items():
             take = getattr(self, f"_take_{kind}")
@@ -134,7 +144,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
                 is_called = getattr(entity, "callback", None) is not None or kind == "client"
                 if entity is not None and is_called and (kind != "timer" or entity.handle.is_timer_ready()):
                     yield take, entity
-        for waitable in self._waitables:
+        for waitable in waitables:
             if waitable.is_ready(self._wait_set):
                 yield self._take_waitable, waitable
 
