@@ -157,6 +157,10 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         with self._tasks_lock:
             self._tasks.append((Task(coroutine, executor=self), None, None))
 
+    def _take_timer(self, timer: Any) -> Any:
+        """Take a timer, unless one that was called before it in this turn has cancelled it."""
+        return super()._take_timer(timer) if timer.handle.is_timer_ready() else None
+
     def _resume_tasks(self) -> bool:
         """Begin or resume tasks; return whether one has ended, for which others may wait."""
         with self._tasks_lock:

@@ -140,6 +140,21 @@ def test_entities_come_and_go_while_it_spins(kind, shared_context):
         assert ticks.count("other") == count
 
 
+def test_a_timer_may_cancel_another_that_is_due(kind, shared_context):
+    with spun(kind, shared_context[0]) as (_, node, until):
+        timers = list[Any]()
+
+        def cancel_the_others() -> None:
+            for timer in timers[1:]:
+                timer.cancel()
+
+        timers += [node.create_timer(0.002, cancel_the_others) for _ in range(3)]
+        time.sleep(0.01)
+        until(lambda: all(timer.is_canceled() for timer in timers[1:]))
+        until(timers[0].is_ready)
+        until(lambda: not timers[0].is_ready())
+
+
 def test_what_a_callback_raises_comes_out_of_spin_and_the_others_go_on(kind, shared_context):
     with spun(kind, shared_context[0]) as (_, node, until):
         ticks = list[int]()
