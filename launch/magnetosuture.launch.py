@@ -48,7 +48,7 @@ def generate_launch_description() -> LaunchDescription:
         return DeclareLaunchArgument(name, default_value=default, description=description, **options)
 
     def switch(name: str, description: str) -> DeclareLaunchArgument:
-        return argument(name, "false", description, choices=["true", "false"])
+        return argument(name, "false", description, choices=["true", "false", "True", "False"])
 
     def nodes(context: LaunchContext) -> list[Node]:
         given = LaunchConfiguration("setup_file").perform(context)
@@ -56,7 +56,8 @@ def generate_launch_description() -> LaunchDescription:
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
         autostart = LaunchConfiguration("autostart").perform(context)
-        planner, enclaves = (LaunchConfiguration(name).perform(context) == "true" for name in ("planner", "enclaves"))
+        switches = (LaunchConfiguration(name).perform(context).lower() for name in ("planner", "enclaves"))
+        planner, enclaves = (value == "true" for value in switches)
         frame, prefix = (LaunchConfiguration(name).perform(context) for name in ("parent_frame", "frame_prefix"))
         inner = LaunchConfiguration("namespace").perform(context)
         # As launch_ros does it: what a group pushes comes before, but not before an absolute namespace.

@@ -12,11 +12,11 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 
 from magnetosuture_thread.bags.packing import packed_pose, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.node import GuardedNode
+from magnetosuture_thread.nodes.program import run
 
 RATES = {"commander": 50.0, "tracker": 60.0, "fuzzer": 1000.0}  # Hz
 SPEED = 0.001  # m/s; too slow for the bridge to judge whether a needle follows whose pose is always the same
@@ -24,7 +24,7 @@ TAIL, HEADING = np.array([-0.0035, 0.0]), np.array([1.0, 0.0])
 ODD = (0.0, -0.0, 1.0, -1.0, 0.01, -0.02, 5e-324, 1e308, -1e308, math.inf, -math.inf, math.nan)
 
 
-class TrafficNode(Node):
+class TrafficNode(GuardedNode):
     """Publishes velocity commands, poses, or anything at all.
 
     Parameters: `kind`, commander, tracker or fuzzer; `burst` and `pause` [s], of a commander that falls silent again

@@ -25,8 +25,8 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.evaluation.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox, joined
-from magnetosuture_thread.nodes.console import RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
+from magnetosuture_thread.nodes.clients import Inbox, Participant
+from magnetosuture_thread.nodes.console import NAME, RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.rig.setups import Setup, read_setup
@@ -89,7 +89,8 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
     with ExitStack() as stack:
         if options.graph:
             setup = read_setup(name)
-            graph = ConsoleGraph(stack.enter_context(joined(namespace=options.namespace)), settings(setup))
+            page = stack.enter_context(Participant(NAME, namespace=options.namespace))
+            graph = ConsoleGraph(page.node, settings(setup))
             host = RecordingHost(graph, setup, options.record, log)
         else:
             source = None
@@ -99,8 +100,8 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
             shown = settings(read_setup(name) if source is None else source.given.setup)
             shown = replace(shown, image_transport=source.transport) if source and source.transport else shown
             logs, domain = Path(stack.enter_context(TemporaryDirectory())), stack.enter_context(live.own_domain())
-            node = stack.enter_context(joined(domain=domain, simulated_clock=source is not None))
-            graph = ConsoleGraph(node, shown)
+            page = stack.enter_context(Participant(NAME, domain=domain, simulated_clock=source is not None))
+            graph = ConsoleGraph(page.node, shown)
             if source is None:
                 host = SimulatedHost(graph, name, logs, options.record, log)
             else:
@@ -259,6 +260,7 @@ class RecordingHost(GraphHost):
         Raises:
             GraphError: a node has ended.
         """
+        self.graph.spin()
         if self._recording is not None and self._recording.ended:
             await self._end_recording()
 

@@ -24,8 +24,13 @@ from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import COMPILING
 from magnetosuture_thread.nodes.player import DEPTH, LiveReplay
-from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
-from magnetosuture_thread.nodes.run import Interruption
+from magnetosuture_thread.nodes.processes import (
+    Interruption,
+    NodeProcesses,
+    environment_of,
+    graph_environment,
+    reserved_domain,
+)
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
@@ -36,12 +41,11 @@ if TYPE_CHECKING:
 
 START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 POLL_PERIOD = 0.02  # s between two looks at the nodes
+TOO_SLOW = "machine too slow"
 
-# Arguments for the nodes, after `--ros-args`. Where two cores carry the whole graph and a recording besides, the bridge
-# leaves them more of it. Whatever a setup says for a launch, nobody would activate the nodes of a command.
-OWN = ["-p", "coil_bridge:rate:=100.0"]
-for _name in interface.STANDBY_NODES:
-    OWN += ["-p", f"{_name}:autostart:=active"]
+# Arguments for the nodes, after `--ros-args`. Whatever a setup says for a launch, nobody would activate the nodes of a
+# command.
+OWN = [part for name in interface.STANDBY_NODES for part in ("-p", f"{name}:autostart:=active")]
 # Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
 FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
 
@@ -251,6 +255,8 @@ def replay_live(
                     log("evaluating the outputs")
                     metrics, summary = _summary(given, folder, live, **checked)
                     replay.write_results(folder, given, metrics, summary, log)
+                    if late := lateness(summary, given.setup.coils.pose_timeout, rate):
+                        log(f"{TOO_SLOW}: {late}")
                     if loop:
                         log("the first pass is recorded and evaluated; playing on until Ctrl-C")
                         try:
@@ -265,6 +271,21 @@ def replay_live(
     if problem:
         raise GraphError(problem)
     return summary
+
+
+def lateness(summary: ReplaySummary, pose_timeout: float, rate: float) -> str:
+    """Return that predictions came later than coils wait for a pose, and what to do; empty if they did not.
+
+    Args:
+        summary: of a replay.
+        pose_timeout: age of a pose from which on coils rest [s].
+        rate: how much faster than recorded it was played.
+    """
+    latency = summary.latency["frame to prediction" if summary.source == "camera" else "pose to prediction"]
+    if latency is None or rate * latency.p99 <= pose_timeout:
+        return ""
+    limit = f"with poses older than {pose_timeout:g} s coils rest"
+    return f"predictions came {latency.p99:.2g} s late (99th percentile); {limit}; try --rate {0.5 * rate:g}"
 
 
 def _check_poses(given: recorded.BagInput, log: Log) -> dict[str, Any]:

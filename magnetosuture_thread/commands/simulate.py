@@ -6,7 +6,6 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -42,7 +41,6 @@ SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
 EXTRA_TIME = 20.0  # s of simulated time
 MIN_RATE = 0.5  # of real time; the least that the rig's setting `rate` takes
 MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another camera than the setup's
-TOO_SLOW = "machine too slow"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +87,7 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
         raise
     terminal.print(loop_table(summary))
     if summary.too_slow:
-        terminal.log(f"{TOO_SLOW}: {summary.too_slow}")
+        terminal.log(f"{live.TOO_SLOW}: {summary.too_slow}")
     terminal.log(f"bag: {options.output}")
     command.write_json(options.json, summary.to_json())
     outcome = summary.procedure
@@ -152,14 +150,16 @@ def simulate(
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
     if problem:
-        raise GraphError(f"{problem}; what was recorded is in {output}")
+        if task.result is None:
+            raise GraphError(f"{problem}; what was recorded is in {output}")
+        task.result |= {"state": "failed" if task.stage else task.result["state"], "reason": problem}
     log("evaluating the run")
     figures = {"setup": setup.name, "procedure": task.result}
     try:
         summary = measure_loop(Bag(output), setup).summary(setup.name)
         slow = too_slow(summary.skipped, summary.frames, rate or 1.0)
         if slow and task.result is not None and task.result["state"] == "failed":  # which tells nothing of the planner
-            task.result |= {"state": TOO_SLOW, "reason": f"{slow}; then {task.result['reason']}"}
+            task.result |= {"state": live.TOO_SLOW, "reason": f"{slow}; then {task.result['reason']}"}
         summary = replace(summary, procedure=task.result, too_slow=slow)
         figures = summary.to_json()
     except GraphError as error:
@@ -194,7 +194,6 @@ class _Path:
         share: that is done, 0 to 1.
         ended: whether it is done.
         result: what came of a procedure; None for a path.
-        client: in the graph while the run goes on.
     """
 
     node = "path_follower"
@@ -202,7 +201,6 @@ class _Path:
     recorded: tuple[topics.Topic, ...] = ()
     stage, share, ended = 0, 0.0, False
     result: dict[str, Any] | None = None
-    client: Any = nullcontext()
 
     def __init__(self, setup: Setup, duration: float | None) -> None:
         if not setup.follower.waypoints:
@@ -212,14 +210,12 @@ class _Path:
         self.time_limit = 3.0 * float(arc_lengths(points)[-1]) / setup.follower.speed + EXTRA_TIME + (duration or 0.0)
         self._duration = duration
 
-    def poll(self, recorder: clients.Recorder) -> str:
-        """Take what is new; return what went wrong."""
+    def poll(self, recorder: clients.Recorder) -> None:
+        """Take what is new."""
         state, values = recorder.status_texts.get(self.node, ("", {}))
         self.stage = 2 if recorder.taken[interface.TIP_SETPOINT.recorded] else int(self.node in recorder.status_texts)
         self.share = float(values.get("progress", 0.0))
         self.ended = state == "done" and self._duration is None
-        bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
-        return f"coil_bridge: {bridge}" if bridge.startswith("fault: ") else ""
 
     def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
         """Return what to report of a run that does not end."""
@@ -250,30 +246,31 @@ class _Procedure:
         self.arguments = (*scene, *live.FORECAST)
         self.result: dict[str, Any] = {"procedure": procedure.name, "state": "not begun", "reason": "", "goals_met": 0}
         self.result |= {"goals": len(procedure.goals), "min_clearance_m": None}
-        self.client = clients.ProcedureClient(str(find_file("procedure", name).resolve()))
+        self._file = str(find_file("procedure", name).resolve())
+        self._client: clients.ProcedureClient | None = None  # once the graph runs
 
-    def poll(self, recorder: clients.Recorder) -> str:
-        """Take what is new; return nothing, as what goes wrong is in the result."""
-        self.client.poll()
-        status, result = self.client.status, self.client.result
+    def poll(self, recorder: clients.Recorder) -> None:
+        """Take what is new."""
+        if self._client is None:
+            self._client = clients.ProcedureClient(recorder.node, self._file)
+        self._client.poll()
+        status, result = self._client.status, self._client.result
         if status is not None:
             self.stage = 2
             self.share = (status.goals_met + status.progress) / self.result["goals"]
             self.result["min_clearance_m"] = finite_or_none(status.clearance)
         for report in (status, result):
             if report is not None:
-                self.result |= {"state": report.state, "reason": report.reason, "goals_met": report.goals_met}
+                state = clients.procedure_state(report)
+                self.result |= {"state": state, "reason": report.reason, "goals_met": report.goals_met}
         self.ended = result is not None
-        return ""
 
     def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
-        """Register that the run does not end; return nothing."""
+        """Return what to report of a run that does not end."""
         if self.stage == 0:
-            self.result["reason"] = self.client.refusal or "no needle planner"
-        else:
-            reason = f": {self.result['reason']}" if self.result["reason"] else ""
-            self.result |= {"state": "failed", "reason": f"{self.result['state']} after {elapsed:.0f} s{reason}"}
-        return ""
+            return (self._client and self._client.refusal) or "no needle planner"
+        reason = f": {self.result['reason']}" if self.result["reason"] else ""
+        return f"{self.result['state']} after {elapsed:.0f} s{reason}"
 
 
 @dataclass
@@ -307,11 +304,8 @@ class _Run:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
             with live.own_graph(processes, arguments, folder / "logs", nodes, self.log) as graph:
                 sink, clock = _Sink(bag), self.rate is not None
-                recorder = clients.Recorder(graph.domain, recorded, simulated_clock=clock, receive=sink.receive)
-                try:
+                with clients.Recorder(graph.domain, recorded, simulated_clock=clock, receive=sink.receive) as recorder:
                     return self._run(graph, recorder, sink)
-                finally:
-                    recorder.close()
 
     def _run(self, graph: live.OwnGraph, recorder: clients.Recorder, sink: _Sink) -> str:
         with graph.interruption:
@@ -324,7 +318,7 @@ class _Run:
             # For bridge and recorder: on a busy machine the recorder finds who steers up to 3 s after the bridge does,
             # and the bag would lack the start.
             graph.nodes.start(self.task.node, arguments=("-p", f"{self.task.node}:audience:=2"))
-            with graph.interruption, self.task.client:
+            with graph.interruption:
                 return self._steer(recorder, graph.check)
         except KeyboardInterrupt:
             return INTERRUPTED  # passed on once the bag is whole
@@ -336,15 +330,15 @@ class _Run:
         while True:
             check()
             recorder.spin(live.POLL_PERIOD)
-            problem = task.poll(recorder)
+            task.poll(recorder)
             if task.stage > stage:
                 stage, began = task.stage, time.monotonic()
             elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
             self.progress(task.share if duration is None else min(1.0, elapsed / duration) * bool(stage))
-            if task.ended:
+            fault = recorder.status_texts.get("coil_bridge", ("", {}))[0]
+            if task.ended or fault.startswith("fault: "):  # after which the needle rests for good
                 recorder.spin(0.5 / rate)
-            if problem or task.ended:
-                return problem
+                return "" if task.ended else f"coil_bridge: {fault}"
             if duration is not None and stage and elapsed > duration + (EXTRA_TIME if stage == 1 else 0.0):
                 return ""
             if elapsed > (task.time_limit if stage else live.START_TIMEOUT):

@@ -1,7 +1,7 @@
-"""Who is in a graph without an executor: messages are queued in the middleware, and polled.
+"""Who is in a graph beside its nodes: it hears and answers when it looks, some hundred times a second.
 
-Waiting for hundreds of messages a second in rclpy would cost as much as the nodes that send them. The middleware keeps
-the latest messages and their time of arrival.
+To wake up for each of hundreds of messages a second would cost as much as the nodes that send them. The middleware
+keeps the latest messages and their time of arrival meanwhile.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -21,20 +21,20 @@ from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
 from rclpy.action import ActionClient
-from rclpy.client import Client
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 from typing_extensions import Self
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.bags.reading import clock_nanoseconds, constant_name
+from magnetosuture_thread.bags.reading import constant_name
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.node import JITTER_KEYS, MAX_REASON_CHARS, SCHEDULING, GuardedNode, read_status
 from magnetosuture_thread.settings.errors import GraphError, shortened
 from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, Service
@@ -52,68 +52,93 @@ TRANSITIONS = {
 DONE = "done"
 
 
-@contextmanager
-def joined(
-    *, name: str = "console", domain: int | None = None, namespace: str = "", simulated_clock: bool = False
-) -> Iterator[GuardedNode]:
-    """Create a node in a graph, in a context of its own.
+class Participant:
+    """A node in a graph, in a context of its own, until it is closed; a context manager too.
 
     Args:
         name: of the node.
         domain: the graph's ROS domain; the one that the environment names if None.
         namespace: of the graph, where it is in one.
         simulated_clock: whether its time is that of /clock.
+
+    Attributes:
+        node: as made.
     """
-    context = Context()
-    rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=SignalHandlerOptions.NO)
-    # rclpy's own service of types is answered by an executor only.
-    parameters = [
-        Parameter("start_type_description_service", value=False),
-        Parameter("use_sim_time", value=simulated_clock),
-    ]
-    options: dict[str, Any] = {"parameter_overrides": parameters, "start_parameter_services": False}
-    node = GuardedNode(name, context=context, namespace=namespace, **options)
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+
+    def __init__(
+        self, name: str, *, domain: int | None = None, namespace: str = "", simulated_clock: bool = False
+    ) -> None:
+        self._context = Context()
+        no_handlers = SignalHandlerOptions.NO
+        rclpy.init(context=self._context, domain_id=domain, args=[], signal_handler_options=no_handlers)
+        parameters = [
+            Parameter("start_type_description_service", value=False),
+            Parameter("use_sim_time", value=simulated_clock),
+        ]
+        options: dict[str, Any] = {"parameter_overrides": parameters, "start_parameter_services": False}
+        self.node = GuardedNode(name, context=self._context, namespace=namespace, **options)
+        self._executor = KeptWaitSetExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> Self:
+        """Return this."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave the graph."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def spin_some(self) -> None:
+        """Take what has come."""
+        self._executor.spin_some()
+
+
+def listen(
+    node: Node, topic: topics.Topic, depth: int, take: Callable[[bytes, Any], None], *, reliable: bool = False
+) -> Subscription:
+    """Subscribe to the messages of a topic as bytes.
+
+    Args:
+        node: that subscribes.
+        topic: to subscribe.
+        depth: of the middleware's queue; beyond it, the oldest messages are lost.
+        take: called with the CDR bytes of each message, and what the middleware says of it.
+        reliable: whether every publisher is reliable, whatever the topic's own quality of service.
+    """
+    reliability = ReliabilityPolicy.RELIABLE if reliable else topic.qos.reliability or ReliabilityPolicy.RELIABLE
+    quality = QoSProfile(depth=depth, reliability=reliability, durability=topic.qos.durability)
+
+    def received(data: bytes, info: Any) -> None:  # rclpy counts the arguments of a callback
+        take(bytes(data), info)
+
+    return node.create_subscription(topic.message, topic.name, received, quality, raw=True)
 
 
 class Inbox:
-    """Queue of the messages of a topic since the last poll.
+    """Queue of the messages of a topic that have come since it was last read.
 
     Args:
         node: that subscribes.
         topic: to subscribe.
         depth: of the queue; beyond it, the oldest messages are lost.
-        reliable: whether every publisher is reliable, whatever the topic's own quality of service.
     """
 
-    def __init__(self, node: Node, topic: topics.Topic, depth: int, *, reliable: bool = False) -> None:
+    def __init__(self, node: Node, topic: topics.Topic, depth: int) -> None:
         self.topic = topic
-        own = ReliabilityPolicy.RELIABLE if reliable else topic.qos.reliability or ReliabilityPolicy.RELIABLE
-        quality = QoSProfile(depth=depth, reliability=own, durability=topic.qos.durability)
-        self._node, self._depth = node, depth
-        self._subscription = node.create_subscription(topic.message, topic.name, _never, quality, raw=True)
-
-    def messages(self) -> Iterator[tuple[bytes, dict[str, Any]]]:
-        """Yield the queued messages, no more than the queue holds: CDR bytes, and what the middleware says of each.
-
-        In a flood there would always be one more.
-        """
-        subscription = self._subscription
-        with subscription.handle:
-            for _ in range(self._depth):
-                found = subscription.handle.take_message(subscription.msg_type, True)
-                if found is None:
-                    return
-                yield bytes(found[0]), found[1]
+        self._messages: deque[tuple[bytes, int]] = deque(maxlen=depth)
+        subscription = listen(node, topic, depth, self._take)
+        self.close = partial(node.destroy_subscription, subscription)
 
     def take(self) -> Iterator[tuple[bytes, int]]:
         """Yield the queued messages: CDR bytes, and time of arrival [ns]."""
-        for data, info in self.messages():
-            yield data, info["received_timestamp"]
+        while self._messages:
+            yield self._messages.popleft()
 
     def read(self) -> Iterator[tuple[Any, int]]:
         """Yield the queued messages, and their time of arrival [ns]; invalid ones are skipped."""
@@ -121,14 +146,8 @@ class Inbox:
             with suppress(InvalidInputError):
                 yield self.topic.decode(data), arrived
 
-    @property
-    def has_publisher(self) -> bool:
-        """Whether a publisher of the topic has been found."""
-        return bool(self._subscription.get_publisher_count())
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        self._node.destroy_subscription(self._subscription)
+    def _take(self, data: bytes, info: Any) -> None:
+        self._messages.append((data, info["received_timestamp"]))
 
 
 class Latest:
@@ -185,10 +204,6 @@ class Latest:
         return None if self.value is None else {**self.value, "age": self.age}
 
 
-def _never(data: bytes) -> None:
-    """Stand in for a callback: no executor calls any."""
-
-
 class Services:
     """Clients of services, created at once so that the emergency stop is discovered before it is needed.
 
@@ -198,6 +213,7 @@ class Services:
     """
 
     def __init__(self, node: Node, kinds: Mapping[str, Any]) -> None:
+        self._node = node
         self._clients = {name: node.create_client(kind, name) for name, kind in kinds.items()}
 
     def ready(self, name: str) -> bool:
@@ -237,7 +253,7 @@ class Services:
                 calls.append(client.call_async(request))
                 retry_at = now + retry_period
             await asyncio.sleep(POLL_PERIOD)
-            _take_answers(client)
+            self._node.executor.spin_some()
             for call in calls:
                 if call.done():
                     return call.result()
@@ -246,48 +262,7 @@ class Services:
         )
 
 
-def _take_answers(client: Client) -> None:
-    """Take the answers to all calls of a client, as an executor does."""
-    with client.handle:
-        while (found := client.handle.take_response(client.srv_type.Response))[0] is not None:
-            with suppress(KeyError):  # somebody else has answered already
-                client.get_pending_request(found[0].request_id.sequence_number).set_result(found[1])
-
-
-def answer_requests(node: Node) -> None:
-    """Answer what waits at a node's services."""
-    for service in node.services:
-        with service.handle:
-            request, header = service.handle.service_take_request(service.srv_type.Request)
-            if header is not None:
-                service.send_response(service.callback(request, service.srv_type.Response()), header)
-
-
-class _Client:
-    """A client that is in the graph while it is entered.
-
-    Args:
-        name: of its node.
-        namespace: of the graph, where it is in one.
-    """
-
-    def __init__(self, name: str, namespace: str = "") -> None:
-        self._name, self._namespace, self._stack = name, namespace, ExitStack()
-
-    def __enter__(self) -> Self:
-        """Join the graph."""
-        self._open(self._stack.enter_context(joined(name=self._name, namespace=self._namespace)))
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Leave the graph."""
-        self._stack.close()
-
-    def _open(self, node: Node) -> None:
-        raise NotImplementedError
-
-
-class CoilClient(_Client):
+class CoilClient(Participant):
     """Client of the coil bridge on the ROS domain of the environment.
 
     Args:
@@ -295,9 +270,8 @@ class CoilClient(_Client):
     """
 
     def __init__(self, namespace: str = "") -> None:
-        super().__init__("coil_client", namespace)
-
-    def _open(self, node: Node) -> None:
+        super().__init__("coil_client", namespace=namespace)
+        node = self.node
         switches: dict[str, Any] = {Service.ARM: SetBool, Service.EMERGENCY_STOP: Trigger, Service.RESET: Trigger}
         self._services = Services(node, {**switches, "coil_bridge/change_state": ChangeState})
         self._state = Latest(node, topics.BRIDGE_STATE)
@@ -362,7 +336,7 @@ class CoilClient(_Client):
         Raises:
             GraphError: no diagnostics were received.
         """
-        values = _wait_for(self._timing_values, "no coil_bridge diagnostics received")
+        values = self._wait_for(self._timing_values, "no coil_bridge diagnostics received")
         median, p99, maximum = (float(values[name]) for name in JITTER_KEYS)
         return (median, p99, maximum), values[SCHEDULING]
 
@@ -379,7 +353,7 @@ class CoilClient(_Client):
             self._state.poll()
             return self._state.value
 
-        return _wait_for(latest, "no coil_bridge state received on this ROS domain")
+        return self._wait_for(latest, "no coil_bridge state received on this ROS domain")
 
     def _call(self, name: str, request: Any, **options: Any) -> Any:
         try:
@@ -389,15 +363,16 @@ class CoilClient(_Client):
                 raise
             raise GraphError(f"no coil_bridge on this ROS domain: {error}") from None
 
-
-def _wait_for(read: Callable[[], Any], problem: str) -> Any:
-    """Return what a function returns, once that is not None; raise `GraphError` if that takes too long."""
-    deadline = time.monotonic() + TIMEOUT
-    while (found := read()) is None:
-        if time.monotonic() > deadline:
-            raise GraphError(f"{problem} within {TIMEOUT:g} s")
-        time.sleep(POLL_PERIOD)
-    return found
+    def _wait_for(self, read: Callable[[], Any], problem: str) -> Any:
+        """Return what a function returns, once that is not None; raise `GraphError` if that takes too long."""
+        deadline = time.monotonic() + TIMEOUT
+        while True:
+            self.spin_some()
+            if (value := read()) is not None:
+                return value
+            if time.monotonic() > deadline:
+                raise GraphError(f"{problem} within {TIMEOUT:g} s")
+            time.sleep(POLL_PERIOD)
 
 
 def _millimetres(vector: Any) -> str:
@@ -412,34 +387,17 @@ def _listed(texts: Any) -> str:
     return shortened("; ".join(texts), MAX_REASON_CHARS)
 
 
-@dataclass(frozen=True)
-class ProcedureReport:
-    """What the planner reports of a procedure.
-
-    Attributes:
-        state: planned, running, paused, done or failed; unknown where there is none.
-        reason: why it is paused or has failed; empty else.
-        goals_met: how many goals are met.
-        progress: completed share of the present goal's path, 0 to 1.
-        clearance: minimum distance of the needle's axis from wall and shapes so far [m]; NaN if unknown.
-    """
-
-    state: str
-    reason: str
-    goals_met: int
-    progress: float = 0.0
-    clearance: float = math.nan
-
-
-def _state_name(state: int) -> str:
-    name = constant_name(ProcedureState, state, "STATE_")
+def procedure_state(message: Any) -> str:
+    """Return the state of a procedure, or of its result: planned, running, paused, done or failed; unknown if none."""
+    name = constant_name(ProcedureState, message.state, "STATE_")
     return {"ready": "planned", "idle": "unknown"}.get(name, name)
 
 
-class ProcedureClient(_Client):
-    """Client of the needle planner on the ROS domain of the environment; nothing happens but in `poll`.
+class ProcedureClient:
+    """Client of the needle planner.
 
     Args:
+        node: in its graph, which somebody else spins.
         procedure: name, path or YAML text.
 
     Attributes:
@@ -448,25 +406,16 @@ class ProcedureClient(_Client):
         refusal: why it could not begin the last time, as the needle may not be tracked yet.
     """
 
-    def __init__(self, procedure: str) -> None:
-        super().__init__("procedure_client")
+    def __init__(self, node: Node, procedure: str) -> None:
         self._request = ExecuteProcedure.Goal(procedure=procedure)
         self._send_at: float | None = None  # None until the planner is found, infinite while it executes the goal
-        self.status: ProcedureReport | None = None
-        self.result: ProcedureReport | None = None
+        self._client = ActionClient(node, ExecuteProcedure, EXECUTE_PROCEDURE)
+        self.status: ProcedureState | None = None
+        self.result: ExecuteProcedure.Result | None = None
         self.refusal = ""
 
-    def _open(self, node: Node) -> None:
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
-        self._client = ActionClient(node, ExecuteProcedure, EXECUTE_PROCEDURE)
-        self._stack.callback(self._client.destroy)
-        self._stack.callback(self._executor.shutdown)
-
     def poll(self) -> None:
-        """Send the goal once the planner is there, and take what has come."""
-        for _ in range(20):
-            self._executor.spin_once(timeout_sec=0.0)
+        """Send the goal once the planner is there."""
         now = time.monotonic()
         if self._send_at is None:
             if self._client.server_is_ready():
@@ -477,24 +426,22 @@ class ProcedureClient(_Client):
             sent.add_done_callback(lambda sent: sent.result().get_result_async().add_done_callback(self._on_result))
 
     def _on_feedback(self, message: Any) -> None:
-        status = message.feedback.status
-        figures = status.goals_met, status.progress, status.clearance
-        self.status = ProcedureReport(_state_name(status.state), status.reason, *figures)
+        self.status = message.feedback.status
 
     def _on_result(self, ended: Future) -> None:
         result = ended.result().result
         if self.status is not None or result.state == ProcedureState.STATE_DONE:
-            self.result = ProcedureReport(_state_name(result.state), result.reason, result.goals_met)
+            self.result = result
         else:
             self.refusal, self._send_at = result.reason, time.monotonic() + 2.0  # s; then it is sent again
 
 
-class Recorder:
+class Recorder(Participant):
     """A node that records the serialised messages of some topics.
 
     Args:
         domain: the graph's ROS domain.
-        taken: topics to take.
+        recorded: topics to record.
         simulated_clock: whether the time is that of /clock.
         receive: called with topic, time of arrival [ns] and CDR bytes of every message.
 
@@ -506,44 +453,34 @@ class Recorder:
     def __init__(
         self,
         domain: int,
-        taken: Sequence[topics.Topic],
+        recorded: Sequence[topics.Topic],
         *,
         simulated_clock: bool,
         receive: Callable[[str, int, bytes], None],
     ) -> None:
-        self._receive = receive
-        self._now = 0 if simulated_clock else None
+        super().__init__("recorder", domain=domain, simulated_clock=simulated_clock)
+        self._receive, self._is_simulated = receive, simulated_clock
         self.taken: Counter[str] = Counter()
         self.status_texts: dict[str, tuple[str, dict[str, str]]] = {}
-        self._stack = ExitStack()
-        node = self._stack.enter_context(joined(name="recorder", domain=domain))
-        followed = (topics.CLOCK, *taken) if simulated_clock else taken
-        self._inboxes = [Inbox(node, topic, 1000) for topic in followed]
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._stack.close()
+        self._subscriptions = {
+            topic.name: listen(self.node, topic, 1000, partial(self._take, topic)) for topic in recorded
+        }
 
     def silent(self) -> list[str]:
         """Return the topics without a publisher."""
-        return [inbox.topic.name for inbox in self._inboxes if not inbox.has_publisher]
+        return [name for name, subscription in self._subscriptions.items() if not subscription.get_publisher_count()]
 
     def spin(self, duration: float) -> None:
         """Receive messages for a time [s]."""
         end = time.monotonic() + duration
-        while time.monotonic() < end:
-            for inbox in self._inboxes:
-                for data, arrived in inbox.take():
-                    self._take(inbox.topic, data, arrived)
-            time.sleep(POLL_PERIOD)
+        while (left := end - time.monotonic()) > 0.0:
+            self.spin_some()
+            time.sleep(min(left, 2.0 * POLL_PERIOD))
 
-    def _take(self, topic: topics.Topic, data: bytes, arrived: int) -> None:
-        if topic is topics.CLOCK:
-            with suppress(InvalidInputError):  # no time at all
-                self._now = clock_nanoseconds(topic.decode(data))
-            return
+    def _take(self, topic: topics.Topic, data: bytes, info: Any) -> None:
+        now = self.node.get_clock().now().nanoseconds if self._is_simulated else info["received_timestamp"]
         self.taken[topic.channel.recorded] += 1
-        self._receive(topic.channel.recorded, arrived if self._now is None else self._now, data)
+        self._receive(topic.channel.recorded, now, data)
         if topic.channel is DIAGNOSTICS:
             with suppress(InvalidInputError):
                 for status in topic.decode(data).status:

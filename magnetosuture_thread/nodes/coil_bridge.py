@@ -26,7 +26,7 @@ from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode, SceneFollower
-from magnetosuture_thread.nodes.run import raise_priority
+from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
@@ -46,6 +46,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         with self.health.load("the bridge's kernels"):  # before any driver is open
             self.system = CoilSystem()
         self.system.recall(stop_record(self))
+        self._kept = self.system.latch.latched_reason  # from the process before, until a reset
         self._stamps: dict[str, Any] = {}  # of the last valid command of each input
         self._reactivate = False  # whether a reset activates the node again
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
@@ -123,6 +124,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def reset(self) -> str:
         """Clear the emergency stop and faults; a node that they deactivated is active again, but disarmed."""
         self.system.reset()
+        self._kept = ""
         if self._reactivate and self.stage == "inactive":
             self.require(self.trigger_activate)
         self._reactivate = False
@@ -263,7 +265,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._log(closed or latch.state.value, driver)
         level, text = self.health.ok, closed or latch.stop_reason or "following commands"
         if latch.latched_reason:
-            level, text = self.health.error, f"fault: {latch.latched_reason}"
+            level, text = self.health.error, self._fault()
         elif not closed and not driver.ready:
             level, text = self.health.warn, f"{latch.stop_reason or 'armed'}; driver: {driver.problem}"
         elif not closed and not latch.stop_reason and (reasons or driver.warnings):
@@ -272,14 +274,25 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             text = stopped if reasons else f"following commands; driver: {'; '.join(driver.warnings)}"
         level(text)
 
+    def _fault(self) -> str:
+        """Return what is latched, and the way out of what has stayed so over a restart."""
+        kept = f", kept over a restart; call {Service.RESET}, then {Service.ARM}" if self._kept else ""
+        return f"fault: {self.system.latch.latched_reason}{kept}"
+
     def _log(self, state: str, driver: DriverState) -> None:
-        """Log changes of state and driver, as a record of incidents."""
-        latch = self.system.latch
-        text = f"{state}{', armed' if latch.armed else ''}{f': {latch.latched_reason}' if latch.latched_reason else ''}"
+        """Log changes of state and driver, as a record of incidents: a fault as an error, a driver's as a warning."""
+        latch, logger = self.system.latch, self.get_logger()
+        text = self._fault() if latch.latched_reason else f"{state}{', armed' if latch.armed else ''}"
         text += f"; driver {self.system.driver_name}: {'ready' if driver.ready else driver.problem}"
-        if text != self._last_log:
-            self._last_log = text
-            self.get_logger().info(text)
+        if text == self._last_log:
+            return
+        self._last_log = text
+        if latch.latched_reason:
+            logger.error(text)
+        elif driver.ready or self.system.bridge is None:
+            logger.info(text)
+        else:
+            logger.warning(text)
 
 
 def _done(answer: Any, problem: str) -> Any:

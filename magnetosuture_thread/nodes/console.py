@@ -7,7 +7,6 @@ import math
 import signal
 import sys
 import time
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -21,17 +20,17 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, read_scene
-from magnetosuture_thread.bags import reading
+from magnetosuture_thread import MagnetosutureError, read_scene
 from magnetosuture_thread.bags.packing import packed_header, packed_point, packed_twist
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.nodes import console_state as page
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox, Latest, Services, answer_requests
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PERIOD, GuardedNode
+from magnetosuture_thread.nodes.clients import Inbox, Latest, Services
+from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
 from magnetosuture_thread.nodes.parameters import declare, init
-from magnetosuture_thread.nodes.run import end_signals
+from magnetosuture_thread.nodes.program import end_signals
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.settings import interface
@@ -80,10 +79,10 @@ RECORDED_TOPICS = tuple(
 class ConsoleGraph:
     """Implementation of `console.client.Graph` over ROS.
 
-    Nothing runs between two calls: messages are queued in the middleware.
+    Nothing runs between two calls: messages are queued in the middleware until `spin`.
 
     Args:
-        node: in the graph; no executor spins it. With `use_sim_time` its time is that of /clock.
+        node: in the graph, and in an executor that nobody else spins.
         settings: of the page.
 
     Attributes:
@@ -107,7 +106,6 @@ class ConsoleGraph:
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
         self._tips = topics.NEEDLE_TIP.publisher(node)
         self._procedures = {name: read_procedure(name).shape_names for name in shipped_names("procedure")}
-        self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
         self._open(settings, _file_scene(settings))
 
@@ -177,6 +175,7 @@ class ConsoleGraph:
 
     def state(self) -> dict[str, Any]:
         """Return the present state; see `console.client.Graph`."""
+        self.spin()
         parts: dict[str, Any] = {}
         for name, latest in self._latest.items():
             latest.poll()
@@ -209,6 +208,7 @@ class ConsoleGraph:
         The nodes of this package stay, but for those of other rigs, which are left out; of all others the latest are
         kept, for a while.
         """
+        self.spin()
         space, now = self.node.get_namespace().strip("/"), time.time_ns()
         for report, arrived in self._reports.read():
             for status in report.status[:MAX_NODES]:
@@ -234,18 +234,18 @@ class ConsoleGraph:
 
     def frame(self) -> tuple[int, bytes] | None:
         """Return number and JPEG or PNG bytes of the latest camera frame; a raw one is encoded here."""
+        self.spin()
         if self._camera.poll():
             self._number += 1
         return None if self._camera.value is None else (self._number, self._camera.value)
 
     def now(self) -> Time:
         """Return the graph's time."""
-        clock = self.node.get_clock()
-        for message, _ in self._clock.read() if self._clock is not None else ():
-            with suppress(InvalidInputError):  # no time at all
-                reading.clock_nanoseconds(message)
-                clock.set_ros_time_override(Time.from_msg(message.clock, clock_type=clock.clock_type))
-        return clock.now()
+        return self.node.get_clock().now()
+
+    def spin(self) -> None:
+        """Take what has come, and answer requests."""
+        self.node.executor.spin_some()
 
     def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
         self.settings, self._scene = settings, scene
@@ -343,15 +343,9 @@ async def _serve(node: GuardedNode, settings: ConsoleSettings) -> None:
     """Serve the page until the process is asked to end; answer the node's services and publish its health."""
     graph = ConsoleGraph(node, settings)
     node.health.ok(f"serving on {settings.address}")
-    due = time.monotonic()
 
     async def watch() -> None:
-        nonlocal due
-        answer_requests(node)
-        if time.monotonic() >= due:
-            due = time.monotonic() + PERIOD
-            graph.now()  # sets the clock for the stamp
-            node.health.publish()
+        graph.spin()
 
     def report(url: str) -> None:
         print(f"the operator's page: {url}", flush=True)
@@ -366,9 +360,9 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(which, signal.default_int_handler)
     try:
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-        # rclpy's own service of types is answered by an executor only.
         options = {"parameter_overrides": [Parameter("start_type_description_service", value=False)]}
-        node = GuardedNode(NAME, **options)
+        node, executor = GuardedNode(NAME, **options), KeptWaitSetExecutor()
+        executor.add_node(node)
         asyncio.run(_serve(node, declare(node, ConsoleSettings, options)))
     except KeyboardInterrupt:
         return 0
@@ -379,6 +373,8 @@ def main(arguments: list[str] | None = None) -> int:
         for which in end_signals():  # a second one must not interrupt what follows
             signal.signal(which, signal.SIG_IGN)
         if node is not None:
+            if node.executor is not None:
+                node.executor.shutdown()
             node.destroy_node()
         rclpy.try_shutdown()
     return 0

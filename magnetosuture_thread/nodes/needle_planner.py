@@ -17,6 +17,7 @@ from magnetosuture_msgs.msg import CoilBridgeState, EstimatedThread, PredictedTh
 from magnetosuture_msgs.msg import ProcedureState as StateMessage
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
+from rclpy.task import Future
 from std_msgs.msg import Header
 
 from magnetosuture_thread import InvalidInputError, Scene
@@ -275,7 +276,6 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
             self._states.publish(message)
             self._report(status)
             self._action.update(message)
-        self._action.finish()
 
     def _report(self, status: ProcedureStatus) -> None:
         name, state, text, level = shortened(status.procedure), status.state, "no procedure", self.health.ok
@@ -331,18 +331,6 @@ def state_message(stamp: Any, status: ProcedureStatus) -> StateMessage:
     )
 
 
-class _DeferredServer(ActionServer):
-    """An action server that calls back when a goal has ended, and not when it begins.
-
-    A callback that waited for the end would keep rclpy's executor busy: it asks every task that waits in each turn.
-    """
-
-    def notify_execute(self, goal_handle: Any, execute_callback: Callable[[Any], Any] | None) -> None:
-        """Begin nothing; with a callback, that a goal has ended, send its result."""
-        if execute_callback is not None:
-            super().notify_execute(goal_handle, execute_callback)
-
-
 class ProcedureAction:
     """Serves the action. Every goal is accepted, as a refusal could give no reason: one that cannot begin is aborted.
 
@@ -355,64 +343,47 @@ class ProcedureAction:
     def __init__(self, node: GuardedNode, begin: Callable[[Any], None], abort: Callable[[str], object]) -> None:
         self._node, self._begin, self._abort = node, begin, abort
         self._goal: Any = None
-        self._cancelled = False
-        self._ended: StateMessage | None = None
-        self._server = _DeferredServer(
+        self._end: Future = Future()  # of the goal's procedure, with its last state
+        self._server = ActionServer(
             node,
             ExecuteProcedure,
             interface.EXECUTE_PROCEDURE,
-            lambda goal: ExecuteProcedure.Result(),
+            self.on_goal,
             goal_callback=lambda request: GoalResponse.ACCEPT,
-            handle_accepted_callback=self.on_goal,
             cancel_callback=self.on_cancel,
         )
+        self.destroy = self._server.destroy
 
-    def on_goal(self, goal: Any) -> None:
-        """Begin the procedure of a goal."""
-        goal.execute()  # it is marked so, and nothing is called
+    async def on_goal(self, goal: Any) -> ExecuteProcedure.Result:
+        """Begin the procedure of a goal, and return its result at its end."""
         try:
             self._begin(goal.request)
         except Exception as error:  # it would come out of `spin`
             self._node.refuse(error)
-            result = ExecuteProcedure.Result(state=StateMessage.STATE_FAILED, reason=reason_of(error))
-            self._send_result(goal, "abort", result)
+            goal.abort()
+            return ExecuteProcedure.Result(state=StateMessage.STATE_FAILED, reason=reason_of(error))
+        self._goal, self._end = goal, Future()
+        status = await self._end
+        if goal.is_cancel_requested:
+            goal.canceled()
+        elif status.state == StateMessage.STATE_FAILED:
+            goal.abort()
         else:
-            self._goal, self._cancelled, self._ended = goal, False, None
+            goal.succeed()
+        return ExecuteProcedure.Result(state=status.state, reason=status.reason, goals_met=status.goals_met)
 
     def on_cancel(self, goal: Any) -> CancelResponse:
         """Give the procedure of a goal up."""
-        if self._goal is None or goal != self._goal or self._ended is not None:
+        if goal != self._goal or self._end.done():
             return CancelResponse.REJECT
-        self._cancelled = True
         self._abort("cancelled by the client of the action")
         return CancelResponse.ACCEPT
 
     def update(self, status: StateMessage) -> None:
         """Take the state of the procedure: feedback of the goal, or its end."""
-        if self._goal is None or self._ended is not None:
+        if self._goal is None or self._end.done():
             return
         if status.state in (StateMessage.STATE_DONE, StateMessage.STATE_FAILED):
-            self._ended = status
+            self._end.set_result(status)
         else:
             self._goal.publish_feedback(ExecuteProcedure.Feedback(status=status))
-
-    def finish(self) -> None:
-        """Send the result of a procedure that has ended; of one that is cancelled once rclpy has marked it so."""
-        goal, ended = self._goal, self._ended
-        if ended is None or (self._cancelled and not goal.is_cancel_requested):
-            return
-        self._goal = self._ended = None
-        end = "canceled" if self._cancelled else "abort" if ended.state == StateMessage.STATE_FAILED else "succeed"
-        result = ExecuteProcedure.Result(state=ended.state, reason=ended.reason, goals_met=ended.goals_met)
-        self._send_result(goal, end, result)
-
-    def destroy(self) -> None:
-        """Take the action out of the graph."""
-        self._server.destroy()
-
-    def _send_result(self, goal: Any, end: str, result: Any) -> None:
-        def finished(handle: Any) -> Any:
-            getattr(handle, end)()
-            return result
-
-        self._server.notify_execute(goal, finished)

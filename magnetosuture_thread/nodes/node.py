@@ -12,21 +12,20 @@ import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property
+from functools import cached_property, partial, partialmethod
 from typing import Any, ClassVar, Generic, TypeVar
 from weakref import ref
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.msg import Transition
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rclpy.service import Service
 from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
@@ -82,18 +81,6 @@ class Health:
         node.create_timer(PERIOD, self.publish, clock=self._clock)
         self._late = node.create_timer(self.quiet, self.publish, clock=self._clock)
         self._late.cancel()
-
-    def ok(self, text: str, **values: object) -> None:
-        """Report level OK."""
-        self._set(DiagnosticStatus.OK, text, values)
-
-    def warn(self, text: str, **values: object) -> None:
-        """Report level WARN: the node continues but cannot do all of its work."""
-        self._set(DiagnosticStatus.WARN, text, values)
-
-    def error(self, text: str, **values: object) -> None:
-        """Report level ERROR: the node cannot do its work."""
-        self._set(DiagnosticStatus.ERROR, text, values)
 
     def stand_by(self, text: str) -> None:
         """Report this at level WARN, whatever else there is to report; an empty text ends that."""
@@ -154,13 +141,21 @@ class Health:
         self._publisher.publish(message)
         self._sent = self._clock.now().nanoseconds * 1e-9
 
-    def _set(self, level: bytes, text: str, values: dict[str, object]) -> None:
+    def report(self, level: bytes, text: str, **values: object) -> None:
+        """Report a level of `DiagnosticStatus`, and values with it.
+
+        OK: the node does its work; WARN: it goes on, but cannot do all of it; ERROR: it cannot do it.
+        """
         text = shortened(text, MAX_REASON_CHARS)
         changed = (level, text) != (self._level, self._text)
         self._level, self._text = level, text
         self._values.update(values)
         if changed and not self._standby:
             self._publish_soon()
+
+    ok = partialmethod(report, DiagnosticStatus.OK)
+    warn = partialmethod(report, DiagnosticStatus.WARN)
+    error = partialmethod(report, DiagnosticStatus.ERROR)
 
     def _publish_soon(self) -> None:
         if self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
@@ -184,8 +179,8 @@ class GuardedNode(Node):
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        for service in self.services:  # rclpy makes some by another way
-            self._guard(service)
+        for service in self.services:  # those of rclpy itself
+            service.callback = partial(_answer, self.get_logger(), service.srv_name, service.callback)
         node = ref(self)  # where a constructor fails, nothing may keep the node: it would stay in the graph
         self.add_on_set_parameters_callback(lambda parameters: _check_parameters(node(), parameters))
 
@@ -215,19 +210,16 @@ class GuardedNode(Node):
         """Publish what others must know before the node ends in order; the graph is still there."""
 
     def serve(self, service: interface.Service, callback: Callable[[Any, Any], Any]) -> Service:
-        """Offer a service."""
-        return self.create_service(topics.ros_class(service.type_name), service, callback)
-
-    def create_service(self, *arguments: Any, **options: Any) -> Service:
-        """Create a service whose callback may raise."""
-        return self._guard(super().create_service(*arguments, **options))
+        """Offer a service, whose callback may raise."""
+        answer = partial(_answer, self.get_logger(), service, callback)
+        return self.create_service(topics.ros_class(service.type_name), service, answer)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *arguments: Any, **options: Any
     ) -> Subscription:
         """Subscribe; of /clock, to which rclpy subscribes by itself, only a possible time is passed on."""
         if msg_type is ClockMessage and not options.get("raw"):
-            found: Callable[[], Any] = ref(self)
+            node: Callable[[], Any] = ref(self)
             options["raw"], received = True, callback
 
             def callback(data: bytes) -> None:
@@ -235,16 +227,11 @@ class GuardedNode(Node):
                     message = topics.CLOCK.decode(data)
                     reading.clock_nanoseconds(message)
                 except InvalidInputError as error:
-                    found().refuse(error)
+                    node().refuse(error)
                 else:
                     received(message)
 
         return super().create_subscription(msg_type, topic, callback, *arguments, **options)
-
-    def _guard(self, service: Service) -> Service:
-        if not isinstance(service.callback, _GuardedCallback):
-            service.callback = _GuardedCallback(service, self.get_logger())
-        return service
 
 
 def _check_parameters(node: Any, parameters: list[Parameter]) -> SetParametersResult:
@@ -258,37 +245,33 @@ def _check_parameters(node: Any, parameters: list[Parameter]) -> SetParametersRe
     return SetParametersResult(successful=not reason, reason=reason)
 
 
-class _GuardedCallback:
-    """Callback of a service that answers an exception by an error in the service's own form."""
-
-    def __init__(self, service: Service, logger: Any) -> None:
-        self._call: Callable[[Any, Any], Any] = service.callback
-        self._name, self._logger = service.srv_name, logger
-
-    def __call__(self, request: Any, response: Any) -> Any:
-        reason = ""
-        try:
-            _check_lengths(request)
-            if not isinstance(request, SetParameters.Request):
-                return self._call(request, response)
+def _answer(logger: Any, name: str, callback: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+    """Return the answer of a service's callback; of one that raises, an error in the service's own form."""
+    reason = ""
+    try:
+        _check_lengths(request)
+        if isinstance(request, SetParameters.Request):
             # Each for itself: one that fails must not hide what became of those before it.
-            response.results = [self._set(parameter) for parameter in request.parameters]
+            response.results = [_set_parameter(callback, parameter) for parameter in request.parameters]
             reason = next((result.reason for result in response.results if not result.successful), "")
-        except Exception as error:
-            reason = reason_of(error)
-            response = _refused(type(response)(), reason, request)
-        if reason:  # one line for all of a request: rclpy takes long to find out who logs
-            self._logger.warning(f"{self._name} refused: {reason}", throttle_duration_sec=PERIOD)
-        return response
+        else:
+            response = callback(request, response)
+    except Exception as error:
+        reason = reason_of(error)
+        response = _refused(type(response)(), reason, request)
+    if reason:  # one line for all of a request: rclpy takes long to find out who logs
+        logger.warning(f"{name} refused: {reason}", throttle_duration_sec=PERIOD)
+    return response
 
-    def _set(self, parameter: Any) -> SetParametersResult:
-        try:
-            answer = self._call(SetParameters.Request(parameters=[parameter]), SetParameters.Response())
-        except Exception as error:
-            return SetParametersResult(successful=False, reason=reason_of(error))
-        result = answer.results[0]
-        result.reason = shortened(result.reason, 2 * MAX_REASON_CHARS)  # rclpy's own may hold a name from outside
-        return result
+
+def _set_parameter(callback: Callable[[Any, Any], Any], parameter: Any) -> SetParametersResult:
+    try:
+        answer = callback(SetParameters.Request(parameters=[parameter]), SetParameters.Response())
+    except Exception as error:
+        return SetParametersResult(successful=False, reason=reason_of(error))
+    result = answer.results[0]
+    result.reason = shortened(result.reason, 2 * MAX_REASON_CHARS)  # rclpy's own may hold a name from outside
+    return result
 
 
 def reason_of(error: Exception) -> str:
@@ -362,6 +345,7 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         except ConfigurationError:
             self._leave()
             raise
+        self._service_change_state.callback = partial(self._change_state, self._service_change_state.callback)
         self.add_on_set_parameters_callback(self._check_change)
         self.add_post_set_parameters_callback(self._put_in_force)
 
@@ -423,14 +407,9 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
     def give_back(self, entity: Any) -> None:
         """Take an entity that is held out of the graph."""
         self._held.remove(entity)
-        kinds = (
-            (Publisher, self.destroy_publisher),
-            (Subscription, self.destroy_subscription),
-            (Service, self.destroy_service),
-            (Timer, self.destroy_timer),
-        )
-        destroy = next((destroy for kind, destroy in kinds if isinstance(entity, kind)), type(entity).destroy)
-        destroy(entity)
+        destroys = (self.destroy_publisher, self.destroy_subscription, self.destroy_service, self.destroy_timer)
+        if not any(destroy(entity) for destroy in destroys):  # of which each knows its own
+            entity.destroy()
 
     def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Return a callback of a subscription or timer that is called only while the node is active."""
@@ -564,6 +543,11 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
             result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
             if not result.successful:
                 raise MagnetosutureError(result.reason)
+
+    def _change_state(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+        """Make a transition; a lifecycle manager, as that of nav2, also configures what `autostart` has configured."""
+        response.success = request.transition.id == Transition.TRANSITION_CONFIGURE and self.stage == "inactive"
+        return response if response.success else change(request, response)
 
     def _release_all(self) -> None:
         try:

@@ -13,7 +13,7 @@ from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
-from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT
+from magnetosuture_thread.nodes.program import DELIVERY_TIMEOUT
 from magnetosuture_thread.planning.follower import PathFollowerSettings, prepare_paths
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
+from functools import partial
 from typing import Any, TypeAlias
 
 import rclpy.time
@@ -17,7 +18,7 @@ from magnetosuture_thread.bags.cdr import header_stamp
 from magnetosuture_thread.bags.reading import nanoseconds
 from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox, answer_requests, joined
+from magnetosuture_thread.nodes.clients import Participant, listen
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
@@ -100,7 +101,7 @@ class Losses:
         return counts
 
 
-class LiveReplay:
+class LiveReplay(Participant):
     """A node that plays messages into the graph with /clock, and passes on all outputs.
 
     What it plays that is an output of a node otherwise, as poses are where no tracker runs, it passes on as well. Its
@@ -144,14 +145,13 @@ class LiveReplay:
         self.losses = Losses()
         self.published: dict[str, dict[int, float]] = defaultdict(dict)
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
-        self._stack = ExitStack()
-        self._node = self._stack.enter_context(joined(name="replay", domain=domain))
-        self._node.serve(interface.Service.PAUSE_REPLAY, self._on_pause)
-        self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
+        super().__init__("replay", domain=domain)
+        self.node.serve(interface.Service.PAUSE_REPLAY, self._on_pause)
+        self._clock = self.node.create_publisher(Clock, "/clock", qos_profile_system_default)
         # A quality of service that waits for slow readers: only the replay has time to.
         reliable: dict[str, Any] = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}
         self._inputs = {
-            topic.channel.recorded: self._node.create_publisher(
+            topic.channel.recorded: self.node.create_publisher(
                 topic.message, topic.name, QoSProfile(**reliable, durability=topic.qos.durability)
             )
             for topic in played
@@ -159,15 +159,11 @@ class LiveReplay:
         self._echoed = {topic.channel.recorded for topic in played if topic in topics.OUTPUTS}
         # Poses are played where no tracker runs.
         unheard = {topics.TRACKER_STATE, topics.THREAD_OBSERVATION} if self._echoed else set()
-        self._outputs = [
-            Inbox(self._node, topic, DEPTH, reliable=True)
+        self._outputs = {
+            topic: listen(self.node, topic, DEPTH, partial(self._on_output, topic), reliable=True)
             for topic in topics.OUTPUTS
             if topic.channel.recorded not in self._echoed and topic not in unheard
-        ]
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._stack.close()
+        }
 
     def wait_for_graph(self) -> None:
         """Wait until every played input has a subscriber and every output a publisher.
@@ -187,7 +183,7 @@ class LiveReplay:
                 if name not in (interface.CAMERA_INFO.recorded, interface.SCENE.recorded)
                 and not publisher.get_subscription_count()
             ]
-            silent = (inbox.topic for inbox in self._outputs if not inbox.has_publisher)
+            silent = (topic for topic, heard in self._outputs.items() if not heard.get_publisher_count())
             missing += [topic.name for topic in silent if topic not in topics.ON_REQUEST]
             if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")
@@ -280,12 +276,12 @@ class LiveReplay:
     def _take(self) -> None:
         """Take the outputs that have come, and answer requests."""
         self._watch()
-        answer_requests(self._node)
-        for inbox in self._outputs:
-            for data, info in inbox.messages():
-                with suppress(InvalidInputError, ValueError):  # no message of ours
-                    self._count(inbox.topic, data, info)
-                    self._receive(inbox.topic.channel.recorded, self._time.now(), data)
+        self.spin_some()
+
+    def _on_output(self, topic: topics.Topic, data: bytes, info: dict[str, Any]) -> None:
+        with suppress(InvalidInputError, ValueError):  # not a message of ours
+            self._count(topic, data, info)
+            self._receive(topic.channel.recorded, self._time.now(), data)
 
     def _count(self, topic: topics.Topic, data: bytes, info: dict[str, Any]) -> None:
         is_currents = topic.channel is interface.CURRENTS  # which count by the command that they follow, if any

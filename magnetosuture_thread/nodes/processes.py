@@ -1,4 +1,4 @@
-"""The graph's nodes as processes of their own, on a ROS domain of their own."""
+"""Nodes as processes: on a ROS domain of their own, their priority, and signals that interrupt who started them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
-from magnetosuture_thread.nodes.run import raise_priority
+from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.settings.errors import GraphError
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
@@ -198,3 +201,74 @@ class NodeProcesses:
 def _end_with_parent() -> None:
     """Ask Linux to interrupt this process when its parent dies."""
     _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
+
+
+def raise_priority(priority: int, process: int | None = None) -> str:
+    """Give all threads of a process a real-time priority, and return the result as text.
+
+    Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some
+    milliseconds. Threads that begin later inherit the priority.
+
+    Args:
+        priority: of SCHED_FIFO, 1 to 99; with 0 all stays as it is.
+        process: its number; this one if None.
+
+    Returns:
+        How the process is scheduled now, for a person.
+    """
+    if not priority:
+        return "ordinary"
+    try:
+        for thread in Path(f"/proc/{process or 'self'}/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+    except ProcessLookupError:
+        pass  # a thread that has just ended
+    except OSError as error:
+        return f"ordinary; real-time priority {priority} refused ({error.strerror}), see `ulimit -r`"
+    return f"real time, priority {priority}"
+
+
+class Interruption:
+    """Keeps the signals that interrupt this process until it is asked whether one came.
+
+    The library behind rclpy calls Python to make and convert messages, and has its own idea of an exception there: a
+    KeyboardInterrupt comes out as another error, or is lost. Signals that are ignored, or that end the process
+    without a word to Python, are left as they are, and outside the main thread, which gets none, so are all.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._before: list[tuple[signal.Signals, Callable[[int, FrameType | None], Any]]] = []
+
+    def __enter__(self) -> Interruption:
+        """Begin to keep signals."""
+        if threading.current_thread() is threading.main_thread():
+            handlers = [(which, signal.getsignal(which)) for which in STOPS]
+            self._before = [(which, handler) for which, handler in handlers if callable(handler)]
+            for which, _ in self._before:
+                signal.signal(which, self._keep)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Keep no more; raise for one that came, unless something was raised already.
+
+        Raises:
+            KeyboardInterrupt: a signal came.
+        """
+        for which, handler in self._before:
+            signal.signal(which, handler)
+        if error[0] is None:
+            self.check()
+
+    def check(self) -> None:
+        """Raise if a signal came.
+
+        Raises:
+            KeyboardInterrupt: one came.
+        """
+        if self._asked:
+            self._asked = False
+            raise KeyboardInterrupt
+
+    def _keep(self, number: int, frame: FrameType | None) -> None:
+        self._asked = True

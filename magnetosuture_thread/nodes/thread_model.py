@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from queue import SimpleQueue
-from threading import Thread as Worker
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -318,16 +317,12 @@ class ThreadForecasts:
         node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
         node.held(topics.PROCEDURE_PLAN.subscribe(node, self.on_plan))
         node.held(node.serve(interface.Service.FORECAST_PATH, self.on_path))
-        # Stamp of the message [ns], generation, and what makes the forecast; None at the end.
-        self._waiting: SimpleQueue[tuple[int, int, Callable[[], Forecast]] | None] = SimpleQueue()
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="forecasts")
         self._error: Exception | None = None
-        self._worker = Worker(target=self._work, name="forecasts", daemon=True)
-        self._worker.start()
 
     def close(self) -> None:
         """Publish no more; to be called before the publishers are destroyed."""
-        self._waiting.put(None)
-        self._worker.join()
+        self._worker.shutdown(cancel_futures=True)
 
     def reset(self) -> None:
         """Publish nothing until there is another estimate, nor what is being made."""
@@ -374,20 +369,19 @@ class ThreadForecasts:
         self.problem = self._choice.judge(result.estimate)
         slowed = settings.friction_feedback == "all"
         make = self._choice.prepare(forecaster, result.estimate, pose, settings.forecast_horizon, slowed=slowed)
-        self._waiting.put((result.stamp, self._generation, make))
-
-    def _work(self) -> None:
-        while self._error is None and (task := self._waiting.get()) is not None:
-            try:
-                if self._waiting.empty():
-                    self._publish(*task)
-            except MagnetosutureError as error:
-                self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
-            except Exception as error:
-                self._error = error
+        self._worker.submit(self._publish, result.stamp, self._generation, make)
 
     def _publish(self, stamp: int, generation: int, make: Callable[[], Forecast]) -> None:
-        forecast = make()
+        if stamp != self._started:
+            return  # a newer estimate waits
+        try:
+            forecast = make()
+        except MagnetosutureError as error:
+            self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
+            return
+        except Exception as error:
+            self._error = error
+            return
         if generation == self._generation and not self.problem:
             self._published.publish(packed_forecast(stamp, forecast))
             if self._markers.get_subscription_count():

@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -25,9 +25,6 @@ from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES
 from magnetosuture_thread.settings.interface import Channel, Quality
 
-if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.node import GuardedNode
-
 QUALITIES = {
     Quality.SENSOR: qos_profile_sensor_data,
     Quality.FRAMES: QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT),
@@ -37,21 +34,23 @@ QUALITIES = {
         depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
     ),
 }
-# Bytes that a message may have, by its type or package; what is larger is not even decoded.
+# Bytes that a message may have, by the package of its type; what is larger is not even decoded. What is read often, or
+# by a person's page, has little; a scene of the most shapes has 120 kB.
 MAX_BYTES = {
-    "sensor_msgs/msg/CameraInfo": 1 << 16,
-    "magnetosuture_msgs/msg/Scene": 1 << 17,  # the largest has 120 kB
-    "magnetosuture_msgs/msg/ThreadMaterial": 1 << 18,
-    **{
-        f"magnetosuture_msgs/msg/{name}": 1 << 16
-        for name in ("TrackerState", "FilterState", "CoilBridgeState", "ProcedureState", "CoilCurrents")
-    },
+    **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
     "diagnostic_msgs": 1 << 16,
     "sensor_msgs": MAX_FILE_BYTES,
     "visualization_msgs": 1 << 22,
-    **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
 }
+MAX_OTHER_BYTES = 1 << 19
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
+
+
+class Subscriber(Protocol):
+    """A node that reports messages that are refused."""
+
+    create_subscription: Callable[..., Subscription]
+    refuse: Callable[[Exception], None]
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,7 @@ class Topic:
     @property
     def max_bytes(self) -> int:
         """Return how many bytes a message may have."""
-        kind = self.channel.type_name
-        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], 1 << 19)
+        return MAX_BYTES.get(self.channel.type_name.partition("/")[0], MAX_OTHER_BYTES)
 
     @property
     def message(self) -> Any:
@@ -101,7 +99,7 @@ class Topic:
             expected = f"a {self.channel.type_name} of our definition"
             raise InvalidInputError(self.channel.name, f"{len(data)} bytes", expected) from None
 
-    def subscribe(self, node: GuardedNode, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
+    def subscribe(self, node: Subscriber, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         What comes is bytes: what is too large is not made into a message first.
@@ -117,7 +115,7 @@ class Topic:
             self.message, self.name, take, copy(self.qos), qos_overriding_options=options, raw=True
         )
 
-    def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
+    def subscribe_numbered(self, node: Subscriber, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
 
         Where the middleware does not number messages, all that tells is how many publishers there are: of
@@ -137,7 +135,7 @@ class Topic:
         subscription = self.subscribe(node, take, raw=True)
         return subscription
 
-    def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+    def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> None:
         """Call back with the message of some bytes; where they are none, the node reports that they are refused."""
         try:
             message = self.decode(data)

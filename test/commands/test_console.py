@@ -11,15 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from magnetosuture_msgs.msg import CoilCurrents
-from rclpy.context import Context
 
 from benchmarks.page import running_console
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox
+from magnetosuture_thread.nodes.clients import Inbox, Participant
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
 from test.console.visitor import Page, opened, until
 
@@ -32,16 +30,16 @@ running = partial(running_console, MAGNETOSUTURE_TOKEN="only-for-this-test-0123"
 
 
 @contextmanager
-def wire(domain: int) -> Iterator[Inbox]:
-    """Give what goes to the simulated coils."""
-    context = Context()
-    rclpy.init(context=context, domain_id=domain, args=[])
-    node = rclpy.create_node("wire", context=context)
-    try:
-        yield Inbox(node, topics.RIG_CURRENTS, 10)
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+def wire(domain: int) -> Iterator[Callable[[], list[CoilCurrents]]]:
+    """Give a function that returns what has gone to the simulated coils since it was last called."""
+    with Participant("wire", domain=domain) as made:
+        inbox = Inbox(made.node, topics.RIG_CURRENTS, 10)
+
+        def taken() -> list[CoilCurrents]:
+            made.spin_some()
+            return [message for message, _ in inbox.read()]
+
+        yield taken
 
 
 def tail(page: Page) -> np.ndarray:
@@ -61,7 +59,7 @@ async def record_a_second(page: Page) -> None:
     await wait(page, lambda: page.host["recording"] and page.graph["time"] > began + 1.0, "a second")
 
 
-async def steer_and_stop(page: Page, currents: Inbox) -> None:
+async def steer_and_stop(page: Page, currents: Callable[[], list[CoilCurrents]]) -> None:
     """Arm, steer, record, pause, stop in an emergency, and choose another setup."""
     await wait(page, lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "the graph")
     assert (page.host["mode"], page.host["simulated"]) == ("simulated", True)
@@ -84,11 +82,11 @@ async def steer_and_stop(page: Page, currents: Inbox) -> None:
     await wait(page, lambda: any(page.graph["bridge"]["current"]), "currents again")
     assert await page.ask(type="bridge_action", action="stop") == ""
     await wait(page, lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
-    list(currents.take())
+    currents()
     heard: list[CoilCurrents] = []
 
     def enough() -> bool:
-        heard.extend(message for message, _ in currents.read())
+        heard.extend(currents())
         return len(heard) > 10
 
     await wait(page, enough, "currents on the wire")
@@ -107,7 +105,7 @@ async def steer_and_stop(page: Page, currents: Inbox) -> None:
 def test_a_person_steers_the_simulated_rig(tmp_path: Path):
     recordings = tmp_path / "recordings"
 
-    async def use(url: str, currents: Inbox) -> None:
+    async def use(url: str, currents: Callable[[], list[CoilCurrents]]) -> None:
         async with opened(url) as page:
             await steer_and_stop(page, currents)
 

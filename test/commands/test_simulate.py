@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import create_autospec
@@ -21,7 +21,6 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands import reproduce
-from magnetosuture_thread.commands import simulate as simulate_module
 from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate, too_slow
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
@@ -125,16 +124,23 @@ def test_thread_behavior_draws_each_scenario(run, scenario: Path, tmp_path: Path
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["behaviour.json", "behaviour.png", "short"]
 
 
-def test_a_run_whose_bridge_is_stopped_ends_with_the_reason(scenario: Path, tmp_path: Path):
+@pytest.mark.parametrize("procedure", ["", NEAR])
+def test_a_run_whose_bridge_is_stopped_ends_with_the_reason(scenario: Path, tmp_path: Path, procedure: str):
     """The emergency stop is pressed from another process than the bridge's, as the run begins."""
+    file, bag = tmp_path / "near.yaml", tmp_path / "bag"
+    file.write_text(procedure)
 
     def log(text: str) -> None:
         if text == "running":
             assert main(["coils", "stop"]) == 0
 
-    with pytest.raises(GraphError, match="coil_bridge: fault: emergency stop; what was recorded is in"):
-        simulate(str(scenario), tmp_path / "bag", log=log)
-    states = [record.decode() for record in Bag(tmp_path / "bag").records({"/coils/state"})]
+    with pytest.raises(GraphError, match="coil_bridge: fault: emergency stop"):
+        simulate(str(scenario), bag, log=log, procedure=str(file) if procedure else "")
+    if procedure:
+        outcome = json.loads((bag / SUMMARY_FILE).read_text())["procedure"]
+        assert outcome["state"] == "not begun"
+        assert outcome["reason"].startswith("coil_bridge: fault: emergency stop")
+    states = [record.decode() for record in Bag(bag).records({"/coils/state"})]
     assert states[-1].emergency_stopped
     assert not any(states[-1].current)
 
@@ -216,14 +222,3 @@ def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(
 def test_a_machine_that_is_too_slow_is_named(skipped: int, rate: float, words: str):
     expected = f"{skipped} of 109 frames skipped; {words}" if words else ""
     assert too_slow(skipped, 109 - skipped, rate) == expected
-
-
-def test_a_procedure_that_fails_has_its_reason_at_the_end_of_the_table(
-    run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    outcome = {"procedure": "near", "state": "failed", "reason": "no way", "goals_met": 0, "goals": 1}
-    summary = create_autospec(simulate, return_value=replace(run[1], procedure=outcome))
-    monkeypatch.setattr(simulate_module, "simulate", summary)
-    assert main(["simulate", "short", "--output", str(tmp_path / "bag"), "--procedure", "near"]) == 1
-    printed = capsys.readouterr().out
-    assert re.search("short, closed loop(?s:.*)procedure near .*failed", printed)

@@ -14,10 +14,10 @@ import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.processes import graph_environment, is_empty, reserved_domain
 from magnetosuture_thread.nodes.topics import Topic
 from test.nodes.programs import Programs
@@ -33,7 +33,7 @@ class Graph:
 
     def __init__(self, context: Context, domain: int) -> None:
         self.context, self.domain = context, domain
-        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor = KeptWaitSetExecutor(context=self.context)
         self.nodes: list[Node] = []
         self.probe = rclpy.create_node("probe", context=self.context)
         self.nodes.append(self.probe)

@@ -137,7 +137,7 @@ def start_forked(programs: Callable[[], Programs]) -> Callable[..., None]:
 
 def serve() -> None:
     """Fork a program for each line on standard input, and note exit codes."""
-    for name in (*program.MAKERS, "console", "run"):
+    for name in (*program.MAKERS, "console"):
         importlib.import_module(f"magnetosuture_thread.nodes.{name}")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a person who ends the tests
     codes: dict[int, Path] = {}

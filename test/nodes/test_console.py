@@ -21,12 +21,11 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import console as console_graph
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import joined
+from magnetosuture_thread.nodes.clients import Participant
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.nodes.console import ConsoleGraph, GraphHost
+from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
-from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from test.nodes import wire
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
@@ -35,24 +34,14 @@ SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.
 @pytest.fixture
 def node(graph) -> Iterator[Node]:
     """The console's node, in the graph of the test."""
-    with joined(domain=graph.domain) as made:
-        yield made
+    with Participant("console", domain=graph.domain) as made:
+        yield made.node
 
 
 @pytest.fixture
 def console(node: Node) -> ConsoleGraph:
     """The graph as the page has it."""
     return ConsoleGraph(node, ConsoleSettings())
-
-
-def act(console: ConsoleGraph, action: str) -> str:
-    """Press a switch."""
-    return asyncio.run(console.execute_action(action))
-
-
-def bridge(console: ConsoleGraph) -> dict:
-    """Return what the page knows of the bridge, or nothing."""
-    return console.state()["bridge"] or {}
 
 
 def tell(graph, topic: topics.Topic, message, until: Callable[[], object], what: str) -> None:
@@ -63,25 +52,6 @@ def tell(graph, topic: topics.Topic, message, until: Callable[[], object], what:
         return bool(until())
 
     graph.wait(told, what)
-
-
-def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
-    graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
-    graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
-    assert not bridge(console)["armed"]
-    assert act(console, "arm") == ""
-    graph.wait(lambda: bridge(console)["armed"], "the bridge to be armed")
-    assert act(console, "disarm") == ""
-    graph.wait(lambda: not bridge(console)["armed"], "the bridge to be disarmed")
-    assert act(console, "arm") == ""
-    assert act(console, "stop") == ""
-    graph.wait(lambda: bridge(console)["emergency_stopped"], "the emergency stop")
-    assert bridge(console)["state"] == "fault"
-    assert "emergency stop" in act(console, "arm")
-    assert act(console, "reset") == ""
-    graph.wait(lambda: bridge(console)["state"] == "active", "the bridge to be active again")
-    assert not bridge(console)["armed"]
-    assert "expected one of arm, disarm, stop, reset" in act(console, "dance")
 
 
 def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):
@@ -181,22 +151,6 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     shown = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
     assert shown is not None
     assert np.abs(shown.astype(int) - pixels).max() < 12
-
-
-def test_a_rig_is_paused_where_there_is_one(graph, console):
-    host = GraphHost(console)
-    assert not host.state()["can_pause"]
-    assert "no node of this graph" in asyncio.run(host.set_paused(True))
-    rig = graph.add(RigSimulatorNode, **SMALL)
-    graph.wait(lambda: host.state()["can_pause"] and host.state()["simulated"], "the rig")
-    assert asyncio.run(host.set_paused(True)) == ""
-    assert host.state()["paused"]
-    assert rig.time.paused
-    assert asyncio.run(host.set_paused(False)) == ""
-    assert not host.state()["paused"]
-    assert not rig.time.paused
-    assert "not started from the page" in asyncio.run(host.select_setup("petri_150mm_silk"))
-    assert "--graph" in asyncio.run(host.set_recording(True, "an operator"))
 
 
 def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, console):

@@ -142,9 +142,11 @@ def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph, programs)
     assert press(graph, Service.EMERGENCY_STOP).success
     bridge.kill()  # at once after the answer
     states.clear()
-    process(graph, programs, autostart="armed")
+    bridge = process(graph, programs, autostart="armed")
     graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", TIMEOUT)
     assert states[-1].emergency_stopped
+    way_out = "fault: emergency stop, kept over a restart; call coils/reset, then coils/arm"
+    assert re.search(rf"\[ERROR\] .*{way_out}", bridge.output)
     assert stage(graph) == "inactive"
     assert not any(state.armed for state in states)
     assert press(graph, Service.RESET).success

@@ -20,7 +20,6 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
-from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from type_description_interfaces.srv import GetTypeDescription
 
@@ -156,19 +155,3 @@ def test_a_message_that_is_too_large_is_refused_unread(graph, topic: topics.Topi
     graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
     graph.wait(lambda: "expected at most" in str(reports[-1].status[0].values), "the reason")
     assert max(len(str(report)) for report in reports) < 5000
-
-
-def test_a_command_that_is_cut_off_is_refused(graph):
-    graph.add(CoilBridgeNode, scene="dish_35mm")
-    states = graph.listen(topics.BRIDGE_STATE)
-    publisher = graph.probe.create_publisher(
-        topics.OPERATOR_COMMAND.message, topics.OPERATOR_COMMAND.name, topics.OPERATOR_COMMAND.qos
-    )
-    graph.wait(lambda: publisher.get_subscription_count() > 0, "the bridge's subscription")
-    whole = serialize_message(wire.twist_message(graph.now(), np.array([0.001, 0.0])))
-
-    def refused() -> bool:
-        publisher.publish(whole[: len(whole) // 2])
-        return bool(states) and states[-1].refused > 0
-
-    graph.wait(refused, "the refusal")

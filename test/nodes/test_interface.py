@@ -13,18 +13,13 @@ from typing import Any
 
 import pytest
 import yaml
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import CoilClient
-from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.settings import interface
-from magnetosuture_thread.settings.errors import GraphError
-from magnetosuture_thread.settings.interface import PROCESSES, RIG_NODES, SCENE_SERVER
 from test.nodes.conftest import Graph
 from test.nodes.makers import EVERY_NODE
 
@@ -118,16 +113,6 @@ def reference() -> ModuleType:
     return module
 
 
-def served(node: Node) -> dict[str, str]:
-    """Return the type of each of our services that a node offers."""
-    own = {service.srv_name.lstrip("/"): service.srv_type for service in node.services}
-    return {
-        name: f"{kind.__module__.split('.')[0]}/srv/{kind.__name__}"
-        for name, kind in own.items()
-        if name in interface.SERVICES
-    }
-
-
 @pytest.mark.parametrize("name", EVERY_NODE)
 def test_a_node_has_on_the_graph_what_reference_and_policies_say_and_no_more(graph: Graph, name: str):
     make, parameters = EVERY_NODE[name]
@@ -139,7 +124,19 @@ def test_a_node_has_on_the_graph_what_reference_and_policies_say_and_no_more(gra
     assert {key for key, channel in CHANNELS.items() if channel.recorded in ends["subscriptions"]} <= received | {
         "CLOCK"
     }
-    assert served(node) == {key: each.type_name for key, each in interface.SERVICES.items() if each.node == name}
+    served = {each.srv_name.lstrip("/") for each in node.services} & set(interface.SERVICES)
+    assert served == {key for key, each in interface.SERVICES.items() if each.node == name}
+
+
+def test_all_that_a_node_has_is_in_its_namespace(graph: Graph):
+    """So nothing of a rig reaches another one of its ROS domain."""
+    of_all_rigs = {"/diagnostics", "/clock", "/parameter_events", "/rosout"}
+    for name, (make, parameters) in EVERY_NODE.items():
+        node = graph.add(make, namespace="left", **parameters)
+        names = {each.topic_name for each in (*node.publishers, *node.subscriptions)}
+        names |= {each.srv_name for each in node.services if each.srv_name in interface.SERVICES}
+        outside = {each for each in names if not node.resolve_topic_name(each).startswith("/left/")}
+        assert outside <= of_all_rigs, name
 
 
 def test_every_topic_has_an_end_in_the_graph():
@@ -166,24 +163,6 @@ def test_the_page_has_on_the_graph_what_its_policies_allow_and_no_more(graph: Gr
     node.health.ok("serving")
     ConsoleGraph(node, ConsoleSettings())
     check(graph, "console")
-
-
-def test_the_command_coils_has_on_the_graph_what_its_policies_allow_and_no_more(
-    graph: Graph, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-    graph.add(CoilBridgeNode, scene="dish_35mm", autostart="active")
-    with CoilClient() as client:
-        for action in ("arm", "stop", "reset", "deactivate"):
-            with suppress(GraphError):
-                client.execute(action)
-        check(graph, "coil_client")
-
-
-def test_every_process_has_an_enclave():
-    processes = {SCENE_SERVER, *PROCESSES, *RIG_NODES, "needle_planner", "console", "coil_client", "dish_transform"}
-    assert set(enclaves()) == {f"/{name}" for name in processes}
-    assert set(enclaves()["/perception"]) == {"vision_tracker", "thread_model"}
 
 
 def test_who_may_move_the_needle_arm_stop_or_change_the_scene():

@@ -16,7 +16,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import SafetyMargins, TrackerState
+from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker
 
@@ -335,12 +335,3 @@ def test_the_bags_and_the_graph_have_the_same_own_messages():
     for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
-
-
-def test_the_numbers_of_states_and_markers_are_those_of_the_messages():
-    for state in State:
-        message = topics.TRACKER_STATE.decode(packing.packed_tracker_state(7, no_pose(state, "", VIEW)))
-        assert message.state == getattr(TrackerState, f"STATE_{state.name}")
-    for kind in markers.MarkerType:
-        assert kind == getattr(Marker, kind.name)
-    assert (markers.ADD, markers.LINE_STRIP) == (Marker.ADD, Marker.LINE_STRIP)

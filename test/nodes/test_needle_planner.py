@@ -362,12 +362,3 @@ def test_a_second_node_that_commands_pauses_and_nothing_is_begun(graph, make_ben
     _, result = bench.result(bench.send(NEAR))
     assert "2 nodes publish needle/servo_cv" in result.reason
     graph.probe.destroy_publisher(other)
-
-
-def test_a_node_that_ends_gives_up_and_stops_the_needle(graph, make_bench):
-    bench = make_bench()
-    bench.run()
-    with graph.between_callbacks():
-        bench.node.finish()
-    graph.wait(lambda: bench.is_in(ProcedureState.STATE_FAILED, "the needle planner has ended"), "the end")
-    graph.wait(lambda: not bench.is_commanded(), "the needle to be stopped")

@@ -15,9 +15,8 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
+from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
 from magnetosuture_thread.nodes.program import MAKERS
-from magnetosuture_thread.settings.errors import GraphError
 from test.nodes.programs import TIMEOUT
 
 ROOT = Path(__file__).parent.parent.parent
@@ -39,11 +38,6 @@ SETUP = """
 /**/vision_tracker: {{ros__parameters: {{thread_length: {tracker}}}}}
 /**/thread_model: {{ros__parameters: {{thread_length: {model}, segments: 12}}}}
 """
-
-
-def test_the_installed_programs_are_those_that_can_be_run():
-    text = (ROOT / "pyproject.toml").read_text()
-    assert set(re.findall(r'^(\w+) = "magnetosuture_thread\.nodes\.program:main"$', text, re.M)) == set(PROGRAMS)
 
 
 @pytest.mark.parametrize("name", ["coil_bridge"])
@@ -149,37 +143,6 @@ def test_what_a_node_cannot_start_with_is_said_in_one_line(
     assert len(process.errors) == 1, process.output
     assert words in process.errors[0]
     assert "Traceback" not in process.output
-
-
-def test_a_node_that_ends_is_noticed_with_its_last_words(tmp_path: Path, environment: dict[str, str]):
-    path = tmp_path / "bad.yaml"
-    path.write_text("thread_model: {ros__parameters: {thread_length: 19.0}}\n")
-    arguments, words = ["--params-file", str(path)], r"thread_model ended with exit code 1: error: thread_model\.thread"
-
-    def watch(nodes: NodeProcesses) -> None:
-        deadline = time.monotonic() + TIMEOUT
-        while time.monotonic() < deadline:
-            nodes.check()
-            time.sleep(0.02)
-
-    with (
-        NodeProcesses(["thread_model"], arguments, environment, tmp_path / "logs") as nodes,
-        pytest.raises(GraphError, match=words),
-    ):
-        watch(nodes)
-
-
-def test_processes_are_ended_whatever_happens(tmp_path: Path, environment: dict[str, str]):
-    nodes = NodeProcesses(["coil_bridge", "thread_model"], [], environment, tmp_path / "logs")
-
-    def interrupted() -> None:
-        with nodes:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    with pytest.raises(GraphError, match="ended"):
-        nodes.check()
 
 
 def until(condition: Callable[[], bool]) -> None:

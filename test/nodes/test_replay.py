@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -13,36 +11,11 @@ from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.bags.reader import RecordedMessage
-from magnetosuture_thread.nodes import player, timeline, topics
+from magnetosuture_thread.nodes import player, topics
 from magnetosuture_thread.nodes.player import LiveReplay, Losses
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.interface import NEEDLE_POSE
-
-
-def test_time_stands_still_before_it_begins_and_while_it_is_paused(monkeypatch: pytest.MonkeyPatch):
-    now = [50.0]  # s
-    monkeypatch.setattr(timeline, "time", SimpleNamespace(perf_counter=lambda: now[0]))
-    line = Timeline(3 * 10**9, 2.0)
-    now[0] += 1.0
-    assert line.now() == 3 * 10**9
-    line.begin()
-    now[0] += 1.0
-    assert line.now() == 5 * 10**9
-    assert line.left(6 * 10**9) == pytest.approx(0.5)
-    line.pause(True)
-    now[0] += 7.0
-    assert line.paused
-    assert line.now() == 5 * 10**9
-    assert math.isinf(line.left(6 * 10**9))
-    line.pause(False)
-    now[0] += 0.25
-    assert line.now() == round(5.5e9)
-    line.skip_to(10**18)
-    assert line.now() == pytest.approx(10**18, abs=200)  # ns; seconds are floats
-    assert line.left(10**18 + 10**9) == pytest.approx(0.5, abs=1e-6)
-    line.begin()
-    assert line.now() == 3 * 10**9
 
 
 def diagnostics(node: str, **values: int) -> bytes:

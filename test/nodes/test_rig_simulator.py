@@ -66,22 +66,6 @@ def test_frames_come_with_their_truth_and_the_camera(graph):
     assert [wrench.force.x, wrench.force.y, wrench.torque.z] == [*frame.pull.tolist(), frame.moment]
 
 
-def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
-    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    graph.add(RigSimulatorNode, faults=["dim 0.0 60.0"], **SMALL)
-    diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.RIG_CURRENTS, currents(graph, 0, 0, 0, 0))
-    graph.wait(lambda: len(needles) > 5, "frames")
-    assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
-
-    def pulled() -> bool:
-        graph.publish(topics.RIG_CURRENTS, currents(graph, 5, 0, -2, 0))
-        return needles[-1].pose.position.x > 0.0035
-
-    graph.wait(pulled, "the needle to move")
-    graph.wait(lambda: any("running, with dim" in d.status[0].message for d in diagnostics), "the fault's name")
-
-
 def refusals(diagnostics) -> list[str]:
     """Return what was refused."""
     values = [value for array in diagnostics for value in array.status[0].values]

@@ -103,7 +103,7 @@ def test_bytes_that_are_no_scene_are_refused():
     for length in (0, 40, len(whole) // 2, len(whole) - 9):
         with pytest.raises(InvalidInputError, match=r"^scene"):
             parse_scene_message(topics.SCENE.decode(whole[:length]))
-    with pytest.raises(InvalidInputError, match=r"^scene: got 131073 bytes, expected at most 131072"):
+    with pytest.raises(InvalidInputError, match=r"^scene: got \d+ bytes, expected at most "):
         topics.SCENE.decode(bytes(topics.SCENE.max_bytes + 1))
     with pytest.raises(InvalidInputError, match=r"^scene\.version: got"):  # ROS replaces what is no UTF-8
         parse_scene_message(topics.SCENE.decode(whole.replace(b"gripper", b"grip\xff\xfe\xfd")))

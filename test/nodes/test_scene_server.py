@@ -72,15 +72,6 @@ class Server:
         return any(words in report.status[0].message for report in self.reports)
 
 
-def test_the_scene_of_the_parameter_is_latched(graph):
-    server = Server(graph, scene="dish_35mm_post")
-    graph.wait(lambda: bool(server.scenes and server.markers), "the scene, published before anybody listened")
-    assert parse_scene_message(server.scenes[0]) == POST
-    assert server.scenes[0].header.frame_id == "dish"
-    assert server.scenes[0].header.stamp.sec > 0
-    graph.wait(lambda: server.said(f"scene {POST.version}: dish of 35 mm, 1 shape"), "its report")
-
-
 def test_shapes_are_added_replaced_and_removed_and_scenes_loaded(graph, tmp_path: Path):
     server = Server(graph, scene="dish_35mm_post")
     graph.wait(lambda: bool(server.scenes and server.markers), "the scene")

@@ -55,10 +55,6 @@ class Bench:
         self.graph.publish(topics.THREAD_OBSERVATION, wire.observation_message(stamp(k), observation))
         self.graph.wait(lambda: self.taken() > before, "the observation to be taken")
 
-    def wait_for_estimate(self, k: int) -> None:
-        """Wait until the last estimate is of a frame."""
-        self.graph.wait(lambda: bool(self.estimated) and self.estimated[-1].header.stamp == stamp(k), "an estimate")
-
     def show(self, k: int, observation: ThreadObservation | None = None, needle: NeedlePose | None = None) -> Any:
         """Show a frame, its observation first, and return what is estimated."""
         before = len(self.estimated)
@@ -112,25 +108,6 @@ def test_every_frame_has_an_estimate_beside_the_prediction(bench: Bench):
     assert error(bench.estimated[-1], COUNT - 1) < 0.5 * error(bench.predicted[-1], COUNT - 1)
     assert [each.source for each in bench.margins] == [SafetyMargins.OF_ESTIMATE] * COUNT
     bench.graph.wait(bench.hears("predicting"), "the state")
-
-
-def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(bench: Bench):
-    for k in range(3):
-        bench.show(k)
-    for k in (3, 4):
-        bench.pose(k)
-    bench.graph.wait(lambda: len(bench.estimated) == 5, "estimates")
-    assert [each.prediction_only for each in bench.estimated[3:]] == [True, True]
-    bench.observe(3, whole(NODES[3], 3))
-    bench.graph.wait(lambda: len(bench.estimated) == 7, "both estimates again")
-    assert [each.header.stamp for each in bench.estimated[5:]] == [stamp(3), stamp(4)]
-    assert [each.prediction_only for each in bench.estimated[5:]] == [False, True]
-    assert bench.estimated[6].unmeasured_for == pytest.approx(1 / 30.0, abs=1e-6)
-    bench.graph.wait(lambda: len(bench.margins) == 6, "the margins of the last")
-    assert bench.margins[-1].header.stamp == stamp(4)
-    bench.observe(4, whole(NODES[4], 4))
-    bench.graph.wait(lambda: len(bench.estimated) == 8, "the last again")
-    assert not bench.estimated[-1].prediction_only
 
 
 def test_an_observation_that_cannot_be_used_is_survived_and_reported(bench: Bench):

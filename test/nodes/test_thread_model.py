@@ -14,7 +14,6 @@ from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
-from magnetosuture_thread.thread import rod
 from test.examples import FOLDER
 from test.nodes import wire
 
@@ -89,21 +88,6 @@ def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeyp
     assert 0.0 < least.clearance < 1e-3
 
 
-def test_the_papers_formulation_runs_in_the_graph(graph):
-    graph.add(ThreadModelNode, formulation="paper", initial_shape="straight")
-    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-    for k in range(3):
-        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, 1e-4 * k))
-    graph.wait(lambda: len(predicted) == 3 and len(margins) == 3, "predictions")
-    assert predicted[-1].formulation == "paper"
-    assert margins[-1].valid
-    assert {least.barrier for least in margins[-1].minimum} == {
-        "connectivity",
-        "enhanced_connectivity",
-        "stiffness",
-    }
-
-
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -126,20 +110,6 @@ def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
     graph.wait(lambda: len(predicted) == 2, "the next prediction")
     assert np.isfinite([v.x for v in predicted[1].positions]).all()
     assert predicted[1].interval == pytest.approx(0.2)
-
-
-def test_a_step_that_did_not_converge_gives_no_margin(graph, monkeypatch):
-    """One linearisation is not enough for a leap; the thread is shown, but nothing of it is proven."""
-    monkeypatch.setattr(rod, "MAX_SOLVES", 1)
-    graph.add(ThreadModelNode, initial_shape="straight")
-    margins, predicted = graph.listen(topics.MARGINS), graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: len(margins) == 1, "the start")
-    graph.publish(topics.NEEDLE_POSE, pose(1.01, 0.0, 0.0185))
-    graph.wait(lambda: len(predicted) == 2 and len(margins) == 2, "a prediction")
-    assert "not converged in 1 linearisations" in predicted[1].solver_status
-    assert not margins[1].valid
-    assert margins[1].reason == predicted[1].solver_status
 
 
 def test_an_unproven_solution_gives_no_margin(graph):
