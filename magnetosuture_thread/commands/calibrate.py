@@ -163,7 +163,7 @@ def calibrate_bags(
                 if problem := measured.thread_problem():
                     raise BagError(path, problem) from None
                 raise
-            passages.append(replace(passage, unverified=given.recording.unverified))
+            passages.append(replace(passage, unverified=given.recording.salvaged_without_checksum))
         advance(1.0)
     best = BestSettings()
 

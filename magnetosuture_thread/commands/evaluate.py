@@ -473,7 +473,7 @@ def _about(
         begin=given.start,
         duration=given.duration,
         damage=tuple(str(place) for place in recording.damage.regions) if recording.damage else (),
-        unverified=recording.unverified,
+        unverified=recording.salvaged_without_checksum,
         refused=dict(refused.most_common()),
         topics={
             channel.recorded: (channel.type_name, recording.counts[channel.recorded])

@@ -215,7 +215,7 @@ def replay_summary(given: recorded.BagInput, metrics: RunMetrics, **others: Any)
         error_truth=errors["truth"],
         source=given.source,
         damage=str(given.recording.damage or ""),
-        unverified=given.recording.unverified,
+        unverified=given.recording.salvaged_without_checksum,
         estimation=metrics.estimation,
         prediction=compared["prediction"],
         estimate=compared["estimate"],

@@ -211,8 +211,8 @@ class FrameSource:
 
     def _open(self, bag: Bag, log: Log) -> None:
         recording = self._recording = Recording(bag)
-        self.unverified = bag.unverified
-        doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
+        self.unverified = bag.salvaged_without_checksum
+        doubt = f"is unverified: {self.unverified}" if self.unverified else bag.has_no_checksum
         for line in (str(bag.damage or ""), doubt, *recording.remarks):
             if line:
                 log(f"{recording.path} {line}")

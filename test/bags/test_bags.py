@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 
 from magnetosuture_thread.bags.message_types import DecoderCache, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.bags.storage import Budget, MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
@@ -114,7 +114,7 @@ def test_bags_of_rosbag2_are_read(tmp_path: Path, plugin: StoragePlugin):
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert (bag.topics, bag.counts) == (TYPES, {"/text": 200, "/header": 200})
     assert bag.damage is None
-    assert "no checksums" in bag.unchecked
+    assert "no checksums" in bag.has_no_checksum
     assert [r.decode().data for r in bag.records({"/text"}, start=1.0, duration=0.02)] == [
         "text 100",
         "text 101",
@@ -148,8 +148,8 @@ def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
     assert damage is not None
     said = "\n".join(map(str, damage.regions))
     assert "split_4.mcap" in said
-    assert "split_5.mcap, byte 0: is empty" in said
-    assert ("split_6.mcap, byte 0: it is missing" in said) == named
+    assert "split_5.mcap is empty" in said
+    assert ("split_6.mcap is missing" in said) == named
     assert Bag(folder).counts["/text"] >= 160
 
 
@@ -179,7 +179,7 @@ POINT = "geometry_msgs/msg/Point"
 def test_definitions_in_idl_are_taken(fields: str, is_ours: bool):
     """Ours is not used in the place of one that differs."""
     text = f"module geometry_msgs {{ module msg {{ struct Point {{ {fields} }}; }}; }};"
-    decoder = DecoderCache().decoder_of(MessageDefinition(POINT, "ros2idl", text))
+    decoder = DecoderCache(Budget("bag", 0)).decoder_of(MessageDefinition(POINT, "ros2idl", text))
     assert decoder.is_ours == is_ours
     if is_ours:
         point = decoder.decode("/point", b"\0\1\0\0" + struct.pack("<3d", 1.0, 2.0, 3.0))

@@ -34,7 +34,7 @@ def test_a_sound_bag_without_checksums_is_copied_and_stays_unchecked(
     assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 0
     new = Bag(tmp_path / "new")
     assert read(new) == texts(5)
-    assert "damage to it cannot be noticed" in new.unchecked
+    assert "damage to it cannot be noticed" in new.has_no_checksum
     assert cli.main(["bag", "check", str(tmp_path / "new")]) == 0
     assert "nothing is damaged" not in capsys.readouterr().out
 
