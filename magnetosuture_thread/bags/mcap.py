@@ -477,7 +477,8 @@ class McapFile:
         is_scanned = is_scanned or self._is_verified
         chunks = [block for block in self._blocks if block.is_chunk]
         # A recorder does not write the same messages with the same times again, but a copy of a part of a file does.
-        if not self._is_verified and (statistics is None or statistics.chunk_count != len(chunks)):
+        is_odd = regions or statistics is None or _contradiction(statistics, self._blocks, _count(self._blocks))
+        if is_odd and not self._is_verified:
             once = {(block.crc, block.start, block.end): block for block in reversed(chunks)}
             copies = [block for block in chunks if once[block.crc, block.start, block.end] is not block]
             self._blocks = [block for block in self._blocks if block not in copies]

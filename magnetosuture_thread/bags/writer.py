@@ -230,7 +230,7 @@ class BagWriter:
             self._register()
             for message in messages:
                 self._mcap.add_message(*message)
-            self._mcap.flush()  # type: ignore[no-untyped-call]
+            self._mcap.flush()
             self._size = self._stream.tell()
         except OSError as error:
             self._fail(error)
@@ -259,7 +259,7 @@ class BagWriter:
             self._register()
             information = self._information()
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)})
-            self._mcap.finish()  # type: ignore[no-untyped-call]
+            self._mcap.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
             self._stream.close()

@@ -121,6 +121,12 @@ def test_chunks_that_are_swapped_or_there_twice(whole: Whole, tmp_path: Path):
         assert bag is not None
         assert bag.damage is not None
         assert Counter(read(bag)) == whole.messages
+    # A copy that destroys a chunk, so that there are as many as the summary counts.
+    within = (whole.chunks[15][0] + whole.chunks[15][1]) // 2
+    data = whole.data[:within] + whole.data[a:b] + whole.data[within:]
+    bag = whole.judge(tmp_path / "moved.mcap", data, outside(within, within))
+    assert bag is not None
+    assert bag.damage is not None
 
 
 def test_damage_says_where_and_when(whole: Whole, tmp_path: Path):
