@@ -70,28 +70,42 @@ class CorruptError(Exception):
     """Bytes that are no valid record; the text gives the reason."""
 
 
-def split_records(stream: BinaryIO, position: int, size: int) -> Iterator[tuple[int, int, int, bytes]]:
+def split_records(read: Callable[[int, int], bytes], position: int, size: int) -> Iterator[tuple[int, int, int, bytes]]:
     """Yield opcode, start and end of each record from a position on, and its first bytes.
+
+    Args:
+        read: returns the bytes from a position to another.
+        position: where the first record begins.
+        size: where the last one ends.
 
     Raises:
         CorruptError: a record is longer than the rest or than it may be, or none.
     """
     while position < size:
-        stream.seek(position)
-        head = stream.read(_RECORD.size + _MESSAGE.size)
+        head = read(position, position + _RECORD.size + _MESSAGE.size)
         opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
         end = position + _RECORD.size + length
         if end > size:
             raise CorruptError("it is truncated or corrupt")
-        if not (Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= _MIN_PRIVATE_OPCODE):
+        if opcode == Opcode.MESSAGE:
+            is_odd = not _MESSAGE.size <= length <= MAX_RECORD_BYTES
+        elif opcode == Opcode.MESSAGE_INDEX:
+            is_odd = int.from_bytes(head[11:15], "little") != length - 6
+        elif opcode == Opcode.ATTACHMENT or opcode >= _MIN_PRIVATE_OPCODE:
+            is_odd = False
+        else:
+            most = MAX_RECORD_BYTES if opcode == Opcode.CHUNK else MAX_DEFINITION_BYTES
+            is_odd = not Opcode.HEADER <= opcode <= Opcode.DATA_END or length > most
+        if is_odd:
             raise CorruptError("no record where one is expected")
-        most = MAX_RECORD_BYTES if opcode in (Opcode.MESSAGE, Opcode.CHUNK) else MAX_DEFINITION_BYTES
-        is_odd = opcode == Opcode.MESSAGE_INDEX and int.from_bytes(head[11:15], "little") != length - 6
-        is_odd = is_odd or (opcode == Opcode.MESSAGE and length < _MESSAGE.size)
-        if is_odd or (length > most and opcode not in _UNREAD):
-            raise CorruptError(f"a record of {length} bytes")
         yield opcode, position, end, head
         position = end
+
+
+def read_range(stream: BinaryIO, start: int, end: int) -> bytes:
+    """Return the bytes of a file from a position to another."""
+    stream.seek(start)
+    return stream.read(end - start)
 
 
 def parse_record(record: bytes) -> Any:
@@ -287,13 +301,12 @@ class McapFile:
     ) -> Iterator[StoredMessage]:
         messages = []
         try:
-            stream.seek(block.offset)
-            data = stream.read(block.length)
+            data = read_range(stream, block.offset, block.offset + block.length)
             if block.is_chunk:
                 data, has_checksum = unpack_chunk(data)
                 if (block.crc is None and not has_checksum) or block.crc not in (None, zlib.crc32(data)):
                     raise CorruptError("a chunk without a checksum, or other bytes than before")
-            for opcode, first, last, head in split_records(BytesIO(data), 0, len(data)):
+            for opcode, first, last, head in split_records(lambda start, end: data[start:end], 0, len(data)):
                 if opcode == Opcode.MESSAGE:
                     channel, sequence, time, publish_time = _MESSAGE.unpack_from(head, _RECORD.size)
                     if channel in wanted and start <= time <= end:
@@ -314,8 +327,8 @@ class McapFile:
                 return False
             metadata = []
             for entry in summary.metadata_indexes:
-                stream.seek(entry.offset)
-                metadata.append(parse_record(stream.read(min(entry.length, MAX_DEFINITION_BYTES))))
+                length = min(entry.length, MAX_DEFINITION_BYTES)
+                metadata.append(parse_record(read_range(stream, entry.offset, entry.offset + length)))
             stream.seek(-_RECORD.size - 20 - len(MAGIC), 2)
             footer = parse_record(stream.read())
         except (McapError, CorruptError, struct.error, ValueError):
@@ -348,7 +361,7 @@ class McapFile:
         while position < size:
             before = position
             try:
-                for opcode, start, end, head in split_records(stream, position, size):
+                for opcode, start, end, head in split_records(partial(read_range, stream), position, size):
                     self._add(stream, opcode, start, end, head)
                     position = end
                     is_sound = opcode == Opcode.DATA_END or (opcode == Opcode.CHUNK and self._blocks[-1].has_checksum)
@@ -384,8 +397,7 @@ class McapFile:
             run.length = end - run.offset
             run.add(head)
             return
-        stream.seek(start)
-        record = stream.read(end - start)
+        record = read_range(stream, start, end)
         if opcode == Opcode.CHUNK:
             self._add_chunk(record, start)
             return
@@ -405,7 +417,7 @@ class McapFile:
         data, has_checksum = unpack_chunk(record, self._budget)
         block = Block(position, len(record), True, has_checksum, zlib.crc32(data))
         definitions = {}
-        for opcode, start, end, head in split_records(BytesIO(data), 0, len(data)):
+        for opcode, start, end, head in split_records(lambda start, end: data[start:end], 0, len(data)):
             self._budget.spend("records", 1)
             if opcode == Opcode.MESSAGE:
                 block.add(head)
@@ -430,8 +442,7 @@ class McapFile:
 
     def _end(self, stream: BinaryIO, start: int, end: int, size: int) -> None:
         """Verify the summary by the footer, which is all that may be at the end of the file."""
-        stream.seek(start)
-        footer, magic = parse_record(stream.read(end - start)), stream.read()
+        footer, magic = parse_record(read_range(stream, start, end)), stream.read()
         self._is_trusted = _crc(stream, self._data_end, start + _RECORD.size + 16) == footer.summary_crc != 0
         if end != size - len(MAGIC) or magic != MAGIC or not (self._is_trusted or footer.summary_crc == 0):
             raise CorruptError("a summary or an end with a wrong checksum")
@@ -459,9 +470,8 @@ class McapFile:
                     continue
                 if opcode == Opcode.DATA_END:
                     return at
-                stream.seek(at)
                 try:
-                    if unpack_chunk(stream.read(_RECORD.size + length), self._budget)[1]:
+                    if unpack_chunk(read_range(stream, at, at + _RECORD.size + length), self._budget)[1]:
                         return at
                 except CorruptError:
                     continue
