@@ -203,7 +203,7 @@ def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
         return {"refused": 1}
     altered, missing = (read - original).total(), (original - read).total()
     is_noticed = opened.damage is not None or bool(refused)
-    is_doubted = is_noticed or bool(opened.unchecked)
+    is_doubted = is_noticed or bool(opened.has_no_checksum)
     found["damage_noticed" if is_noticed else "altered_and_unchecked" if altered or missing else "whole"] = 1
     # Of a message that was altered unnoticed the original is missing, and the altered one is there in its place.
     found["silently_lost"] += missing > altered and not is_noticed
@@ -216,6 +216,6 @@ def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
     except MagnetosutureError:
         return dict(found)
     made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
-    is_marked = bool(new.unchecked) and not is_noticed
+    is_marked = bool(new.has_no_checksum) and not is_noticed
     found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
     return dict(found)

@@ -18,8 +18,8 @@ from magnetosuture_thread.bags.recording import Recording, UnfitError
 from magnetosuture_thread.bags.storage import (
     CDR,
     MAX_SILENCE,
+    NO_CHECKSUM_NOTE,
     QOS,
-    UNCHECKED_NOTE,
     Connection,
     DamageReport,
     jazzy_qos_profiles,
@@ -131,8 +131,8 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
         "messages": sum(bag.counts.values()),
         "notes": bag.notes,
         "files": bag.facts,
-        "unchecked": bag.unchecked or None,
-        "unverified": bag.unverified or None,
+        "has_no_checksum": bag.has_no_checksum or None,
+        "salvaged_without_checksum": bag.salvaged_without_checksum or None,
         "remarks": bag.remarks,
         "refused": dict(refused),
         "silences": silences,
@@ -148,6 +148,7 @@ def _damage(damage: DamageReport) -> dict[str, Any]:
             "start_byte": region.start,
             "end_byte": region.end,
             "what": region.what,
+            "text": str(region),
             "first_s": None if region.first is None else region.first * 1e-9,
             "last_s": None if region.last is None else region.last * 1e-9,
         }
@@ -203,8 +204,8 @@ def write_repaired_bag(
         BagError: the new bag cannot be written.
     """
     notes = dict(bag.notes)
-    if bag.unchecked and not bag.unverified:
-        notes.setdefault(UNCHECKED_NOTE, f"made by `bag repair` from a bag that {bag.unchecked}")
+    if bag.has_no_checksum and not bag.salvaged_without_checksum:
+        notes.setdefault(NO_CHECKSUM_NOTE, f"made by `bag repair` from a bag that {bag.has_no_checksum}")
     report = RepairReport(dropped=bag.others)
     numbers: dict[Connection, int] = {}
     with BagWriter(folder, notes, name=name, custom_data=bag.custom_data) as writer:

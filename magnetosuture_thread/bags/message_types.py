@@ -1,6 +1,6 @@
 """Message types: our own, known without ROS, and those that a bag defines.
 
-Definitions of a bag are parsed within a budget: one of a kilobyte may describe a message of gigabytes.
+Definitions of a bag are parsed within its budget: one of a kilobyte may describe a message of gigabytes.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from rosbags.typesys.msg import MSGParser
 from rosbags.typesys.peg import Failure, Parser
 from rosbags.typesys.store import Typestore
 
-from magnetosuture_thread.bags.budgets import MAX_DECODED, MAX_DEFINITION_CHARS, MAX_ELEMENTS, MAX_NESTING, ParserBudget
-from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.bags.storage import Budget, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import BudgetError, share_directory
+from magnetosuture_thread.settings.files import share_directory
 
 Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 
 HEADER = "std_msgs/msg/Header"
+MAX_DEFINITION_CHARS = 200_000
+MAX_NESTING = 32  # of message types in each other
+MAX_ELEMENTS = 4_000  # fields that a message has whatever its data, all nested ones counted: a decoder is made for each
+MAX_DECODED = 1_000_000  # objects that the data of one message may become
 
 
 @cache
@@ -57,30 +60,25 @@ class MessageDecoder:
         type_name: for example `nav_msgs/msg/Path`.
         is_ours: whether our definition of the type is used.
         is_known: whether there is any definition that can be used.
-        problem: why the bag's definition is not used; empty where it is, or none is needed.
     """
 
-    def __init__(self, definition: MessageDefinition, budget: ParserBudget) -> None:
+    def __init__(self, definition: MessageDefinition, budget: Budget) -> None:
         self.type_name = name = definition.type_name
-        self.problem = ""
-        self._store: Typestore = get_typestore(Stores.EMPTY)
-        self._density = 0.0
+        self._store, self._problem, self._density = get_typestore(Stores.EMPTY), "", 0.0
         ours = typestore()
-        types: Types = ours.fielddefs
         try:
-            types = {**types, **_parsed_types(definition, budget)}
-            if name in types:
-                self._density = _density(name, types)
-        except BudgetError as error:
+            types: Types = {**ours.fielddefs, **_parsed_types(definition, budget)}
+            fields = _fields_within(name, types) if name in types else {}
+            self._density = _extent((Nodetype.NAME, name), types)[2] if fields else 0.0
+        except BagError as error:
             # Not ours in its place either: its messages are of that definition.
-            self.problem = str(error)
-        fields = {} if self.problem or name not in types else _fields_within(name, types)
+            self._problem, fields = error.problem, {}
         self.is_ours = bool(fields) and name in ours.fielddefs and fields == _fields_within(name, ours.fielddefs)
         if self.is_ours:
             self._store = ours
         elif fields:
             try:
-                self._store.register({each: types[each] for each in fields})
+                self._store.register({kind: types[kind] for kind in fields})
             except Exception:  # A name that is no name in Python, for example.
                 self._store = get_typestore(Stores.EMPTY)
         self.is_known = name in self._store.fielddefs
@@ -91,13 +89,11 @@ class MessageDecoder:
         Raises:
             BagError: the bytes are not of the type, or the type has no definition.
         """
-        if self.problem:
-            raise BagError(topic, f"the type {self.type_name} of its messages has {self.problem}")
         if len(data) * self._density > MAX_DECODED:
-            text = f"a message of {len(data)} bytes may have more than {MAX_DECODED} parts; so many are not decoded"
-            raise BagError(topic, text)
+            raise BagError(topic, f"a message of {len(data)} bytes may have more than {MAX_DECODED} parts")
         if not self.is_known:
-            raise BagError(topic, f"the type {self.type_name or '(no name)'} of its messages has no definition")
+            problem = self._problem or "no definition"
+            raise BagError(topic, f"the type {self.type_name or '(no name)'} of its messages has {problem}")
         try:
             return self._store.deserialize_cdr(data, self.type_name)
         except Exception as error:  # The decoder raises whatever the bytes make it stumble over.
@@ -105,20 +101,21 @@ class MessageDecoder:
 
     def has_header(self) -> bool:
         """Return whether a message is a header or begins with one."""
-        if self.type_name == HEADER and not self.problem:
-            return True
         fields = self._store.fielddefs[self.type_name][1] if self.is_known else []
-        return bool(fields) and fields[0][1][1] == HEADER
+        return self.type_name == HEADER or (bool(fields) and fields[0][1][1] == HEADER)
 
 
 class DecoderCache:
-    """Decoders of the messages of one bag, whose definitions are parsed within one budget.
+    """Decoders of the messages of one bag.
 
     Those of another bag are not shared: whether a definition is still parsed depends on those before it.
+
+    Args:
+        budget: of the bag.
     """
 
-    def __init__(self) -> None:
-        self._budget = ParserBudget()
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
         self._decoders: dict[MessageDefinition, MessageDecoder] = {}
 
     def decoder_of(self, definition: MessageDefinition) -> MessageDecoder:
@@ -131,16 +128,16 @@ class DecoderCache:
 class _Bounded(Parser):
     """A parser that ends after a number of steps: some texts make it try every way to read them."""
 
-    budget: ParserBudget
+    budget: Budget
 
     def literal(self, pos: int, text: str) -> Any:
         """Match a literal."""
-        self.budget.spend()
+        self.budget.spend("steps to parse its definitions", 1)
         return super().literal(pos, text)
 
     def regex(self, pos: int, pattern: str, flags: int = 0) -> Any:
         """Match a pattern."""
-        self.budget.spend()
+        self.budget.spend("steps to parse its definitions", 1)
         return super().regex(pos, pattern, flags)
 
 
@@ -155,31 +152,27 @@ class _BoundedIdlParser(_Bounded, IDLParser):
         return Failure(pos, "", {"a constant without an operator"})
 
 
-def _parsed_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
+def _parsed_types(definition: MessageDefinition, budget: Budget) -> Types:
     """Return the types of a definition; none where it cannot be parsed, or uses types without definition.
 
     An empty definition is ignored for a type that we know: some recorders leave it out.
 
     Raises:
-        BudgetError: it takes too much to parse.
+        BagError: it takes too much to parse.
     """
     name, text = definition.type_name, definition.text
     ours = typestore().fielddefs
     if definition.encoding not in ("ros2msg", "ros2idl") or (not text.strip() and name in ours):
         return {}
     if len(text) > MAX_DEFINITION_CHARS:
-        raise BudgetError(f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
-    budget.begin()
+        raise BagError(name, f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
     try:
-        parser: _Bounded
-        if definition.encoding == "ros2msg":
-            parser = _BoundedMsgParser(f"MSG: {name}\n{text}")
-        else:
-            parser = _BoundedIdlParser(text)
+        is_msg = definition.encoding == "ros2msg"
+        parser = _BoundedMsgParser(f"MSG: {name}\n{text}") if is_msg else _BoundedIdlParser(text)
         parser.budget = budget
         own = dict(make_typesdict(parser.specification()))
-    except BudgetError:
-        raise
+    except BagError:
+        raise BagError(name, "a definition that takes too many steps to parse") from None
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return {}
     used = {_type_within(kind) for _, fields in own.values() for _, kind in fields} - {""}
@@ -188,14 +181,14 @@ def _parsed_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
 
 def _fields_within(name: str, types: Types) -> Types:
     """Return the fields of a type and of all types in it, by type; those of ROS 1 have capitals in their names."""
-    found: Types = {}
+    fields: Types = {}
     waiting = [name]
     while waiting:
-        each = waiting.pop()
-        if each not in found:
-            found[each] = [(field.lower(), kind) for field, kind in types[each][1]]
-            waiting += [inner for _, kind in found[each] if (inner := _type_within(kind))]
-    return found
+        kind = waiting.pop()
+        if kind not in fields:
+            fields[kind] = [(field.lower(), inner) for field, inner in types[kind][1]]
+            waiting += [inner for _, field_kind in fields[kind] if (inner := _type_within(field_kind))]
+    return fields
 
 
 def _type_within(kind: Any) -> str:
@@ -206,49 +199,33 @@ def _type_within(kind: Any) -> str:
     return detail if node is Nodetype.NAME else ""
 
 
-def _density(type_name: str, types: Types) -> float:
-    """Return how many objects a byte of a sequence in a message may become, at most.
+def _extent(kind: Any, types: Types, depth: int = 0) -> tuple[int, int, float]:
+    """Return number of objects and least bytes of a field, and how many objects a byte of a sequence in it may become.
 
     Raises:
-        BudgetError: messages have more parts than they may whatever their data, parts in parts too deep, or sequences
+        BagError: messages have more parts than they may whatever their data, parts in parts too deep, or sequences
             of parts that take no bytes.
     """
-    known: dict[str, tuple[int, int]] = {}
-    density = 0.0
-
-    def extent_of(name: str, depth: int) -> tuple[int, int]:
-        """Return number of objects and least bytes of a type."""
+    node, detail = kind
+    objects, size, density = 1, 1, 0.0
+    if node is Nodetype.BASE:
+        size = 4 if detail[0] == "string" else 1
+    elif node is Nodetype.NAME:
         if depth > MAX_NESTING:
-            raise BudgetError(f"a definition with types more than {MAX_NESTING} deep in each other")
-        if name not in known:
-            objects, size = 1, 0
-            for _, kind in types[name][1]:
-                more, bytes_more = extent_of_field(kind, depth)
-                objects, size = objects + more, size + bytes_more
-                if objects > MAX_ELEMENTS:
-                    raise BudgetError(f"a definition of more than {MAX_ELEMENTS} fields, nested ones counted")
-            known[name] = objects, size
-        return known[name]
-
-    def extent_of_field(kind: Any, depth: int) -> tuple[int, int]:
-        nonlocal density
-        node, detail = kind
-        if node is Nodetype.BASE:
-            return 1, 4 if detail[0] == "string" else 1
-        if node is Nodetype.NAME:
-            return extent_of(detail, depth + 1)
+            raise BagError(detail, f"a definition with types more than {MAX_NESTING} deep in each other")
+        parts = [_extent(inner, types, depth + 1) for _, inner in types[detail][1]]
+        objects, size = 1 + sum(part[0] for part in parts), sum(part[1] for part in parts)
+        density = max((part[2] for part in parts), default=0.0)
+    else:
         inner, count = detail
-        if count < 0:
-            raise BudgetError(f"a definition of an array of {count} parts")
-        if inner[0] is Nodetype.BASE and inner[1][0] != "string":  # one array of numbers, whatever its length
-            return 1, count if node is Nodetype.ARRAY else 4
-        objects, size = extent_of_field(inner, depth)
+        is_numbers = inner[0] is Nodetype.BASE and inner[1][0] != "string"  # one array, whatever its length
+        objects, size, density = (1, 1, 0.0) if is_numbers else _extent(inner, types, depth)
         if node is Nodetype.ARRAY:
-            return count * objects, count * size
-        if not size:
-            raise BudgetError("a definition with a sequence of parts that hold nothing")
-        density = max(density, objects / size)
-        return 1, 4
-
-    extent_of(type_name, 0)
-    return density
+            objects, size = objects if is_numbers else count * objects, count * size
+        elif not size:
+            raise BagError("", "a definition with a sequence of parts that hold nothing")
+        else:
+            objects, size, density = 1, 4, density if is_numbers else max(density, objects / size)
+    if not 0 <= objects <= MAX_ELEMENTS:
+        raise BagError("", f"a definition of more than {MAX_ELEMENTS} fields, nested ones counted")
+    return objects, size, density

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import partial
@@ -17,15 +16,16 @@ from urllib.parse import quote
 import zstandard
 
 from magnetosuture_thread.bags import absolute_topic
-from magnetosuture_thread.bags.budgets import MAX_BLOCK_BYTES, UnpackBudget
 from magnetosuture_thread.bags.mcap import McapFile
 from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
 from magnetosuture_thread.bags.storage import (
     CDR,
+    MAX_RECORD_BYTES,
+    NO_CHECKSUM_NOTE,
     QOS,
+    SALVAGED_NOTE,
     TYPE_HASH,
-    UNCHECKED_NOTE,
-    UNVERIFIED_NOTE,
+    Budget,
     Connection,
     CorruptRegion,
     DamageReport,
@@ -38,19 +38,16 @@ from magnetosuture_thread.bags.storage import (
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
-_SQLITE_ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a name
-_STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
-_MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
-_COLUMNS = {
-    "topics": ("id", "name", "type", "serialization_format"),
-    "messages": ("id", "topic_id", "timestamp", "data"),
+# Tables of rosbag2 with columns that are read. One that is no table, or computes a column, may hold anything.
+_TABLES = {
+    "topics": {"id", "name", "type", "serialization_format"},
+    "messages": {"id", "topic_id", "timestamp", "data"},
+    "message_definitions": set[str](),
 }
 # sqlite3 does not enforce column types, so that a row may hold anything.
-_IS_VALID = (
-    "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
-)
-_COUNT = f"""
-    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM({_IS_VALID})
+_COUNT = """
+    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)),
+    SUM(typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob')
     FROM messages GROUP BY topic_id
 """
 
@@ -58,9 +55,7 @@ _COUNT = f"""
 class SqliteFile:
     """A file of recorded messages in sqlite3, the older format of rosbag2; see `McapFile` for the attributes.
 
-    A database may be anything: tables that compute their rows, trees that lead back to themselves, rows of gigabytes.
-    Only plain tables are read, within a number of steps that depends on the size of the file. A damaged one is refused:
-    nothing tells its altered messages from the others.
+    Only plain tables are read. A damaged one is refused: nothing tells its altered messages from the others.
 
     Args:
         path: the file.
@@ -74,68 +69,69 @@ class SqliteFile:
         self.path = path
         if is_url(path):
             raise BagError(path, "is a database, which is read on its own machine only; copy it to this machine")
-        try:
-            size = path.stat().st_size
-            with path.open("rb") as stream:
-                magic = stream.read(HEAD_BYTES)
-        except OSError as error:
-            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
-        if not magic.startswith(b"SQLite format 3\0"):
-            problem = substitute_problem(magic) or "is no sqlite3 file"
-            raise BagError(path, problem if magic else "is empty, expected a sqlite3 file")
-        self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
         self.notes: dict[str, str] = {}
-        self.unchecked = "has no checksums (sqlite3): damage to it cannot be noticed"
+        self.has_no_checksum = "has no checksums (sqlite3): damage to it cannot be noticed"
         self.others: Counter[str] = Counter()
         self.counts: dict[int, int] = {}
         self.damage: DamageReport | None = None
         try:
+            size = path.stat().st_size
+            with path.open("rb") as stream:
+                head = stream.read(HEAD_BYTES)
+        except OSError as error:
+            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
+        if not head.startswith(b"SQLite format 3\0"):
+            problem = substitute_problem(head) or "is no sqlite3 file"
+            raise BagError(path, problem if head else "is empty, expected a sqlite3 file")
+        try:
             with closing(self._connect()) as database:
-                if (found := str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])) != "ok":
-                    raise self._damaged(found)
-                self._check_tables(database)
+                problem = str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])
+                if problem != "ok":
+                    raise sqlite3.DatabaseError(problem)
+                for table in _TABLES:
+                    self._check_table(database, table)
                 self.connections = _sqlite_connections(database)
                 self._count_messages(database)
-        except _SQLITE_ERRORS as error:
-            # An OperationalError or DataError is no damage: no such column, for example, or too much work.
-            if isinstance(error, sqlite3.DatabaseError) and not isinstance(
-                error, (sqlite3.OperationalError, sqlite3.DataError)
-            ):
-                raise self._damaged(_reason_of(error)) from None
-            raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
+        except (sqlite3.OperationalError, OverflowError) as error:  # no such column, for example: no damage
+            raise BagError(path, f"cannot be read as a bag: {_one_line(error)}") from None
+        except sqlite3.Error as error:
+            problem = f"is damaged ({_one_line(error)}), and has no checksums (sqlite3): nothing of it is used"
+            raise BagError(path, problem) from None
         progress(size)
         self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
 
-    def _check_tables(self, database: sqlite3.Connection) -> None:
-        """Refuse a database whose tables are not those of rosbag2, but views or columns that compute what they hold."""
-        for table, columns in _COLUMNS.items():
-            query = "SELECT type, rootpage > 0 FROM sqlite_master WHERE name = ?"  # a virtual table has no page
-            if database.execute(query, (table,)).fetchall() != [("table", 1)]:
-                raise BagError(self.path, f"has no plain table {table}, which the database of a bag has")
-            hidden = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
-            missing = next((name for name in columns if hidden.get(name) != 0), None)
-            if missing is not None:
-                raise BagError(self.path, f"has no column {missing} in its table {table}, or one that is computed")
+    def _connect(self) -> sqlite3.Connection:
+        """Open the file read-only; nothing is written beside it either, unless a recorder left a journal."""
+        journals = [self.path.with_name(self.path.name + end) for end in ("-wal", "-journal", "-shm")]
+        if strange := next((path for path in journals if path.exists() and not path.is_file()), None):
+            raise BagError(strange, "is a folder, pipe or device, expected the journal of a database")
+        mode = "mode=ro" if any(path.exists() for path in journals[:2]) else "mode=ro&immutable=1"
+        database = sqlite3.connect(f"file:{quote(bytes(self.path.absolute()))}?{mode}", uri=True)
+        for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
+            database.execute(f"PRAGMA {pragma}")
+        return database
+
+    def _check_table(self, database: sqlite3.Connection, table: str) -> None:
+        """Refuse a table of rosbag2 that is a view or a virtual table, which has no page, or computes what it holds."""
+        query = "SELECT type, rootpage > 0 FROM sqlite_master WHERE name = ?"
+        rows = database.execute(query, (table,)).fetchall()
+        columns = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
+        if rows != [("table", 1)] and (rows or _TABLES[table]):
+            raise BagError(self.path, f"has no plain table {table}, which the database of a bag has")
+        plain = {name for name, hidden in columns.items() if not hidden}
+        if problem := ", ".join(sorted((_TABLES[table] - plain) | (columns.keys() - plain))):
+            raise BagError(self.path, f"has no column {problem} in its table {table}, or one that is computed")
 
     def _count_messages(self, database: sqlite3.Connection) -> None:
-        lost = longest = 0
         times: list[int] = []
-        for topic, count, first, last, size, valid in database.execute(_COUNT):
+        for topic, count, first, last, longest, valid in database.execute(_COUNT):
             if topic not in self.connections or valid < count:
-                lost += count - (valid if topic in self.connections else 0)
-                continue
+                raise sqlite3.DatabaseError(f"{count} rows of which some have no valid time, topic or data")
+            if longest > MAX_RECORD_BYTES:
+                raise BagError(self.path, f"has a message of {longest} bytes; at most {MAX_RECORD_BYTES} are read")
             self.counts[topic] = count
             times += first, last
-            longest = max(longest, size)
-        if lost:
-            raise self._damaged(f"{lost} rows without a valid time, topic or data")
-        if longest > MAX_BLOCK_BYTES:
-            raise BagError(self.path, f"has a message of {longest} bytes; at most {MAX_BLOCK_BYTES} are read")
         self.start, self.end = min(times, default=0), max(times, default=0)
-
-    def _damaged(self, problem: str) -> BagError:
-        words = " ".join(problem.split())
-        return BagError(self.path, f"is damaged ({words}), and has no checksums (sqlite3): nothing of it is used")
 
     def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
@@ -144,83 +140,48 @@ class SqliteFile:
             BagError: the file has changed since it was verified, or cannot be read any more.
         """
         wanted = sorted(set(connections) & set(self.counts))
+        query = f"""
+            SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({",".join("?" * len(wanted))})
+            AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id
+        """
         try:
             with closing(self._connect()) as database:
-                marks = ",".join("?" * len(wanted))
-                query = (
-                    f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
-                    f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
-                )
-                rows = database.execute(query, (*wanted, max(start, self.start), min(end, self.end)))
-                yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
-        except _SQLITE_ERRORS as error:
-            raise BagError(self.path, f"cannot be read any more: {_reason_of(error)}") from None
-
-    def _connect(self) -> sqlite3.Connection:
-        """Open the file read-only; nothing is written beside it either, unless a recorder left a journal."""
-        journals = [self.path.with_name(self.path.name + end) for end in ("-wal", "-journal", "-shm")]
-        for journal in journals:
-            if journal.exists() and not journal.is_file():
-                raise BagError(journal, "is a folder, pipe or device, expected the journal of a database")
-        has_journal = any(journal.exists() for journal in journals[:2])
-        mode = "mode=ro" if has_journal else "mode=ro&immutable=1"
-        database = sqlite3.connect(f"file:{quote(os.fsencode(self.path.absolute()))}?{mode}", uri=True)
-        database.text_factory = _decode_text
-        if set_limit := getattr(database, "setlimit", None):  # from Python 3.11 on
-            set_limit(0, 2 * MAX_BLOCK_BYTES)  # SQLITE_LIMIT_LENGTH
-        left = self._max_steps
-
-        def step() -> int:
-            nonlocal left
-            left -= _STEP_INTERVAL
-            return int(left < 0)
-
-        database.set_progress_handler(step, _STEP_INTERVAL)
-        for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
-            database.execute(f"PRAGMA {pragma}")
-        return database
+                for time, topic, data in database.execute(query, (*wanted, max(start, self.start), min(end, self.end))):
+                    yield StoredMessage(time, self.connections[topic], data)
+        except (sqlite3.Error, OverflowError) as error:
+            raise BagError(self.path, f"cannot be read any more: {_one_line(error)}") from None
 
 
-def _decode_text(data: bytes) -> str | None:
-    """Return a text; None if it is not valid UTF-8."""
-    try:
-        return data.decode()
-    except UnicodeDecodeError:
-        return None
-
-
-def _reason_of(error: Exception) -> str:
-    """Return an error of sqlite3 in one line."""
-    if "interrupted" in str(error):
-        return "reading it takes more steps than a recording of its size does"
+def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
 def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
-    definitions = {}
-    with suppress(*_SQLITE_ERRORS):  # Older files have none.
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        rows = database.execute(query)
-        definitions = {row[0]: MessageDefinition(*row) for row in rows if all(isinstance(word, str) for word in row)}
+    """Return the connections; before Jazzy the table of topics had fewer columns, and there were no definitions."""
+    database.row_factory = sqlite3.Row
+    columns = {row["name"] for row in database.execute("PRAGMA table_info(message_definitions)")}
+    rows = database.execute("SELECT * FROM message_definitions") if "encoded_message_definition" in columns else ()
+    definitions = {
+        row["topic_type"]: MessageDefinition(row["topic_type"], row["encoding"], row["encoded_message_definition"])
+        for row in rows
+    }
     connections = {}
-    rows = database.execute("SELECT * FROM topics")
-    names = [column[0] for column in rows.description]
-    for row in rows:
-        values = dict(zip(names, row, strict=True))
-        number, topic, kind, form = (values.get(name) for name in ("id", "name", "type", "serialization_format"))
-        if number in connections:
-            raise sqlite3.DatabaseError("its table of topics leads back to itself")
-        if isinstance(number, int) and isinstance(topic, str) and isinstance(kind, str) and isinstance(form, str):
-            entries = {QOS: values.get("offered_qos_profiles"), TYPE_HASH: values.get("type_description_hash")}
-            metadata = {key: text for key, text in entries.items() if isinstance(text, str)}
-            connections[number] = Connection(topic, definitions.get(kind, MessageDefinition(kind)), form, metadata)
+    for row in database.execute("SELECT * FROM topics"):
+        entries = dict(row)
+        definition = definitions.get(row["type"]) or MessageDefinition(row["type"])
+        metadata = {QOS: entries.get("offered_qos_profiles"), TYPE_HASH: entries.get("type_description_hash")}
+        texts = {key: text for key, text in metadata.items() if isinstance(text, str)}
+        named = (row["name"], definition.type_name, definition.encoding, definition.text, row["serialization_format"])
+        if isinstance(row["id"], int) and all(isinstance(text, str) for text in named):
+            connections[row["id"]] = Connection(row["name"], definition, row["serialization_format"], texts)
+    database.row_factory = None
     return connections
 
 
 Progress = Callable[[float], None]
 BagStorage = McapFile | SqliteFile
 _ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
-_OWN_DECODERS = DecoderCache()  # of messages of no bag
+_OWN_DECODERS = DecoderCache(Budget("messages", 0))  # of messages of no bag
 
 
 @dataclass(slots=True)  # not frozen, which would make creating one four times as slow
@@ -279,9 +240,9 @@ class Bag:
         duration: from the first to the last message [s].
         notes: notes of our writer.
         damage: what is corrupt and lost; None if the bag is intact. Its text is one line.
-        unchecked: why damage may not have been noticed, in one line; empty if it would have been.
-        unverified: why even what is read may be wrong, in one line; empty if nothing speaks against it. An earlier
-            version salvaged such bags from damaged ones without checksums; their notes say so for good.
+        has_no_checksum: why damage may not have been noticed, in one line; empty if it would have been.
+        salvaged_without_checksum: why even what is read may be wrong, in one line; empty if nothing speaks against it.
+            An earlier version salvaged such bags from damaged ones without checksums; their notes say so for good.
         remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
         decoders: of its messages; all its definitions are parsed within one budget.
@@ -296,19 +257,19 @@ class Bag:
         self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda fraction: None
     ) -> None:
         self.path = path
-        self.decoders = DecoderCache()
         found = find_bag_files(path)
-        self._storages, problems = _open(found.files, progress)
-        missing = [CorruptRegion(name, 0, 0, "it is missing") for name in found.missing]
-        lost = [DamageReport((region,), 0, region.end, None) for region in (*missing, *problems)]
+        budget = Budget(path, sum(_file_size(file) for file in found.files))
+        self.decoders = DecoderCache(budget)
+        self._storages, problems = _open(found.files, budget, progress)
+        lost = [DamageReport((region,), 0, region.end, None) for region in (*found.lost, *problems)]
         self.damage = merge_reports([*(storage.damage for storage in self._storages), *lost])
         self.remarks, self.custom_data = found.remarks, found.custom_data
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
         self.others = sum((storage.others for storage in self._storages), Counter[str]())
         self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
-        self.unverified = self.notes.get(UNVERIFIED_NOTE, "")
-        doubt = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
-        self.unchecked = doubt or self.notes.get(UNCHECKED_NOTE, "")
+        self.salvaged_without_checksum = self.notes.get(SALVAGED_NOTE, "")
+        doubt = next((storage.has_no_checksum for storage in self._storages if storage.has_no_checksum), "")
+        self.has_no_checksum = doubt or self.notes.get(NO_CHECKSUM_NOTE, "")
         if not any(storage.counts for storage in self._storages):
             raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         filled = [storage for storage in self._storages if storage.counts]
@@ -367,11 +328,11 @@ class Bag:
             return item.data
         topic = self._names[item.connection.topic]
         try:
-            if zstandard.frame_content_size(item.data) > MAX_BLOCK_BYTES:
-                raise BagError(topic, f"a packed message is larger than {MAX_BLOCK_BYTES} bytes")
+            if zstandard.frame_content_size(item.data) > MAX_RECORD_BYTES:
+                raise BagError(topic, f"a packed message is larger than {MAX_RECORD_BYTES} bytes")
             # Without a size in it, a frame is unpacked to this many bytes at most.
-            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES)
-            return unpacker.decompress(item.data, max_output_size=MAX_BLOCK_BYTES)
+            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES)
+            return unpacker.decompress(item.data, max_output_size=MAX_RECORD_BYTES)
         except (zstandard.ZstdError, MemoryError) as error:
             raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None
 
@@ -426,7 +387,7 @@ class Bag:
         return merge_by_time(parts)
 
 
-def _open(files: list[Path], progress: Progress) -> tuple[list[BagStorage], list[CorruptRegion]]:
+def _open(files: list[Path], budget: Budget, progress: Progress) -> tuple[list[BagStorage], list[CorruptRegion]]:
     """Open the files of a bag; of several, unreadable ones are returned as corrupt regions.
 
     Raises:
@@ -436,7 +397,6 @@ def _open(files: list[Path], progress: Progress) -> tuple[list[BagStorage], list
     problems: list[CorruptRegion] = []
     cause: BaseException | None = None
     total, done = sum(_file_size(file) for file in files), 0
-    budget = UnpackBudget(total)
 
     def report(count: int) -> None:
         nonlocal done

@@ -61,8 +61,8 @@ class Recording:
         start: as the bag's [ns].
         duration: as the bag's [s].
         damage: as the bag's.
-        unchecked: as the bag's.
-        unverified: as the bag's.
+        has_no_checksum: as the bag's.
+        salvaged_without_checksum: as the bag's.
         remarks: as the bag's, and that frames are rectified.
         rectified: the camera's recorded topic where its frames are rectified, as by image_proc: then no lens is to be
             undone, and the bag's camera_info is left out; else empty.
@@ -71,8 +71,8 @@ class Recording:
     def __init__(self, bag: Bag, *, dish_frame: str = DISH_FRAME) -> None:
         self.path = bag.path
         self.notes, self.start, self.duration = bag.notes, bag.start, bag.duration
-        self.damage, self.unchecked = bag.damage, bag.unchecked
-        self.unverified, self.remarks = bag.unverified, list(bag.remarks)
+        self.damage, self.has_no_checksum = bag.damage, bag.has_no_checksum
+        self.salvaged_without_checksum, self.remarks = bag.salvaged_without_checksum, list(bag.remarks)
         self.refused: Counter[str] = Counter()
         self.unfit: dict[str, str] = {}
         self.counts: Counter[str] = Counter()

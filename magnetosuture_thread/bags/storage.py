@@ -1,4 +1,4 @@
-"""What all formats of bags share: their files and metadata, connections, messages by time, and reports of damage."""
+"""What the formats of bags share: files and metadata, connections, messages by time, damage, and caps on sizes."""
 
 from __future__ import annotations
 
@@ -11,27 +11,60 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import yaml
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, BudgetError, check_yaml, read_regular
+from magnetosuture_thread.settings.files import is_url, read_regular
 from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
 
 CDR = "cdr"  # how ROS 2 writes messages
 METADATA_FILE = "metadata.yaml"
 COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in STORAGE_SUFFIXES)
-QOS = "offered_qos_profiles"  # metadata key of a connection, in mcap and in sqlite3
-TYPE_HASH = "topic_type_hash"  # another
-NOTES = "magnetosuture"  # name of the mcap record that holds our notes
-NOTES_PREFIX = f"{NOTES}."  # of our entries in metadata.yaml
-UNVERIFIED_NOTE = "unverified"  # note of a bag that was salvaged from one without checksums: why it may be wrong
-UNCHECKED_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
-MAX_ALIASES = 16  # in metadata.yaml; some recorders write none, others a few
-_CHECKSUM = "crc32"  # note: of all others
+QOS, TYPE_HASH = "offered_qos_profiles", "topic_type_hash"  # metadata of a connection, in mcap and in sqlite3
+NOTES = "magnetosuture"  # name of the mcap record that holds our notes, and prefix of our entries in metadata.yaml
+SALVAGED_NOTE = "unverified"  # note of a bag that an earlier version salvaged without checksums: why it may be wrong
+NO_CHECKSUM_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 MAX_SILENCE = 5.0  # s without any message, which a person waits for; longer is a pause, or a clock that was set
+MAX_RECORD_BYTES = 1 << 26  # of a message or a chunk of messages, packed or not
+MAX_TEXT_BYTES = 1 << 20  # of metadata.yaml, where a topic takes 600 bytes
+MAX_QOS_CHARS = 20_000  # of the quality of service of a topic, where a publisher takes 400
+RANGE_BYTES = 1 << 20  # fetched at once, at least, of a file that a URL names
+_CHECKSUM = "crc32"  # note: of all others
+
+
+class Budget:
+    """Caps on what a bag may take, by the size of its files: some bytes may ask for gigabytes.
+
+    A recorder's compression saves a factor of 2 to 50; a bomb's, thousands. A message takes 5 bytes or more on the
+    disk, and the parts of a split bag repeat their definitions. A usual definition of a message type takes 200 to
+    5,000 steps to parse, 40,000 take a second.
+
+    Args:
+        path: of the bag, for errors.
+        size: of its files [bytes].
+    """
+
+    def __init__(self, path: object, size: int) -> None:
+        self._path = path
+        self._left = {
+            "unpacked bytes": (1 << 29) + 200 * size,
+            "records": 200_000 + size // 4,
+            "bytes of definitions": (1 << 25) + 2 * size,
+            "steps to parse its definitions": 100_000,
+        }
+
+    def spend(self, kind: str, amount: int) -> None:
+        """Count an amount of a kind.
+
+        Raises:
+            BagError: there is more of it than a recording of this size has.
+        """
+        self._left[kind] -= amount
+        if self._left[kind] < 0:
+            raise BagError(self._path, f"takes more {kind} than a recording of its size does")
 
 
 @dataclass(frozen=True)
@@ -41,7 +74,7 @@ class CorruptRegion:
     Attributes:
         file: its name.
         start: first corrupt byte.
-        end: the byte after the last.
+        end: the byte after the last; 0 where the file as a whole is missing.
         what: description, for example `a chunk with a wrong checksum`.
         first: messages may be missing from this time on [ns]; None where it is unknown or none are missing.
         last: ... to this time [ns].
@@ -56,8 +89,7 @@ class CorruptRegion:
 
     def __str__(self) -> str:
         """Return file, bytes and description in one line."""
-        where = f"byte {self.start}" if self.end <= self.start else f"bytes {self.start} to {self.end}"
-        return f"{self.file}, {where}: {self.what}"
+        return f"{self.file}, bytes {self.start} to {self.end}: {self.what}" if self.end else f"{self.file} {self.what}"
 
 
 @dataclass(frozen=True)
@@ -79,7 +111,7 @@ class DamageReport:
     def __str__(self) -> str:
         """Return a summary in one line."""
         others = len(self.regions) - 1
-        where = f"{self.regions[0]}" + (f", and {others} other place{'s' * (others > 1)}" if others else "")
+        where = f"{self.regions[0]}" + (f", and {pluralize(others, 'other place')}" if others else "")
         if self.messages == 0:
             return f"is damaged ({where}), but no message is lost"
         lost = "an unknown number of messages" if self.messages is None else pluralize(self.messages, "message")
@@ -105,15 +137,10 @@ def pluralize(count: int, noun: str) -> str:
 def merge_reports(reports: Iterable[DamageReport | None]) -> DamageReport | None:
     """Return the damage of several files as one report; None if all files are intact."""
     damaged = [report for report in reports if report is not None]
-    if not damaged:
-        return None
     lost = [report.messages for report in damaged if report.messages is not None]
-    return DamageReport(
-        regions=tuple(region for report in damaged for region in report.regions),
-        chunks=sum(report.chunks for report in damaged),
-        bytes=sum(report.bytes for report in damaged),
-        messages=sum(lost) if len(lost) == len(damaged) else None,
-    )
+    regions = tuple(region for report in damaged for region in report.regions)
+    chunks, size = sum(report.chunks for report in damaged), sum(report.bytes for report in damaged)
+    return DamageReport(regions, chunks, size, sum(lost) if len(lost) == len(damaged) else None) if damaged else None
 
 
 @dataclass(frozen=True)
@@ -195,20 +222,26 @@ def merge_by_time(parts: Iterable[tuple[int, Callable[[], Iterator[StoredMessage
             heapq.heappush(heap, (first.time, part, first, items))
 
 
-@dataclass(frozen=True)
+def open_file(path: Path) -> BinaryIO:
+    """Open a file for reading; of a URL only ranges are fetched, by fsspec."""
+    options: dict[str, Any] = {"block_size": RANGE_BYTES, "cache_type": "blockcache"} if is_url(path) else {}
+    return cast(BinaryIO, path.open("rb", **options))
+
+
+@dataclass
 class BagFiles:
     """The files of a bag, and what its metadata.yaml says.
 
     Attributes:
         files: in the order in which they were recorded.
-        missing: names of those that are listed in metadata.yaml and do not exist.
+        lost: those that cannot be read: listed in metadata.yaml and missing, or compressed as a whole.
         remarks: on what is not read or not used, a line each.
         notes: of our writer.
         custom_data: entries of others.
     """
 
-    files: list[Path]
-    missing: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    lost: list[CorruptRegion] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
     custom_data: dict[str, str] = field(default_factory=dict)
@@ -221,66 +254,69 @@ def find_bag_files(path: Path) -> BagFiles:
         path: a file, or a folder with one or, where a recorder split the bag, several.
 
     Raises:
-        BagError: there is no bag.
+        BagError: there is no bag, or all of it is compressed.
     """
     try:
         path.stat()
         is_file = path.is_file()
-        inside = [path] if is_file else sorted(path.iterdir(), key=_by_number)
-        files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
+        inside = [path] if is_file else sorted((file for file in path.iterdir() if file.is_file()), key=_by_number)
     except FileNotFoundError as error:
         raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from error
     except Exception as error:  # The file system of a URL raises whatever its library does.
         problem = getattr(error, "strerror", None) or error
         raise BagError(path, f"cannot be read: {problem}") from error
-    compressed = [file.name for file in inside if file.name.endswith(COMPRESSED_SUFFIXES)]
-    if compressed and not files:
-        raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {compressed[0]}")
+    files = {file.name: file for file in inside if file.suffix in STORAGE_SUFFIXES}
+    packed = [file.name for file in inside if file.name.endswith(COMPRESSED_SUFFIXES) and file.stem not in files]
+    advice = "is compressed as a whole; decompress it first: zstd -d"
+    if packed and not files:
+        raise BagError(path, f"{advice} {packed[0]}")
     if is_file:
         return BagFiles([path])
-    files = files or [file for file in inside if file.suffix == ".bag"][:1]  # of ROS 1, which opening it names
+    bag = BagFiles(lost=[CorruptRegion(name, 0, 0, f"{advice} {name}") for name in packed])
+    # Of ROS 1, which opening it names.
+    files = files or {file.name: file for file in inside if file.suffix == ".bag"}
     if not files:
         raise BagError(path, f"holds no {' or '.join(STORAGE_SUFFIXES)} file")
-    content, remarks = _read_metadata(path)
-    names: list[str] = content.pop("names", [])
-    present = {file.name: file for file in files}
-    if listed := [present[name] for name in names if name in present]:
-        missing = [name for name in names if name not in present]
-        remarks += [f"{name} is not read: {METADATA_FILE} does not list it" for name in present if name not in names]
-        return BagFiles(listed, missing, remarks, **content)
-    bases = {(_by_number(file)[0], file.suffix) for file in files}
-    if len(files) > 1 and (len(bases) > 1 or any(_by_number(file)[1] < 0 for file in files)):
-        kind = " and ".join(sorted({file.suffix for file in files}, reverse=True))
+    listed = [name.removesuffix(".zstd") for name in _read_metadata(path, bag)]
+    if any(name in files for name in listed):
+        absent = [name for name in listed if name not in files and f"{name}.zstd" not in packed]
+        bag.lost += [CorruptRegion(name, 0, 0, "is missing") for name in absent]
+        bag.remarks += [f"{name} is not read: {METADATA_FILE} does not list it" for name in files if name not in listed]
+        bag.files = [files[name] for name in listed if name in files]
+        return bag
+    bases = {(_by_number(file)[0], file.suffix) for file in files.values()}
+    if len(files) > 1 and (len(bases) > 1 or any(_by_number(file)[1] < 0 for file in files.values())):
+        kind = " and ".join(sorted({file.suffix for file in files.values()}, reverse=True))
         raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
-    return BagFiles(files, remarks=remarks, **content)
+    bag.files = [*files.values()]
+    return bag
 
 
 def _by_number(path: Path) -> tuple[str, int, str]:
     """Sort files of a split bag as they were recorded: bag_2 before bag_10."""
-    found = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
-    return (found[1], int(found[2]), path.name) if found else (path.stem, -1, path.name)
+    match = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
+    return (match[1], int(match[2]), path.name) if match else (path.stem, -1, path.name)
 
 
-def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """Return names of files, notes and custom data of a bag's metadata.yaml; and in a line why it is not used."""
+def _read_metadata(folder: Path, bag: BagFiles) -> list[str]:
+    """Return the names of files in a bag's metadata.yaml; set notes and custom data, or why it is not used."""
     try:
         text = read_regular(folder / METADATA_FILE, MAX_TEXT_BYTES).decode("utf-8")
-        check_yaml(text, max_aliases=MAX_ALIASES)
+        if "<<" in text:
+            raise ValueError("merged keys, which may double again and again")
         information = yaml.load(text, yaml.CSafeLoader)["rosbag2_bagfile_information"]
         names = list(dict.fromkeys(Path(name).name for name in information["relative_file_paths"]))
-        custom = information.get("custom_data")
-        entries = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, Mapping) else {}
-        ours = {key.removeprefix(NOTES_PREFIX): entries.pop(key) for key in [*entries] if key.startswith(NOTES_PREFIX)}
-        return {"names": names, "notes": verified_notes(ours) or {}, "custom_data": entries}, []
+        custom = {key: text for key, text in (information.get("custom_data") or {}).items() if isinstance(text, str)}
     except FileNotFoundError:
-        return {}, []
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        return []
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
         problem = getattr(error, "strerror", None) or "is not what rosbag2 writes"
-    except BudgetError as error:
-        problem = f"has {error}"
-    except yaml.YAMLError:
-        problem = "is no YAML"
-    return {}, [f"{METADATA_FILE} is not used: {problem}"]
+        bag.remarks.append(f"{METADATA_FILE} is not used: {problem}")
+        return []
+    own = {key: custom.pop(key) for key in [*custom] if key.startswith(f"{NOTES}.")}
+    bag.notes = verified_notes({key.removeprefix(f"{NOTES}."): text for key, text in own.items()}) or {}
+    bag.custom_data = custom
+    return names
 
 
 def add_checksum(notes: Mapping[str, str]) -> dict[str, str]:
@@ -308,10 +344,8 @@ def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
         text: YAML, as a recorder keeps it with a topic.
     """
     try:
-        if len(text) > MAX_TEXT_BYTES:
-            return []
-        check_yaml(text)
-        return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
+        is_plain = len(text) < MAX_QOS_CHARS and "<<" not in text
+        return [{**profile} for profile in dump_qos_v9(parse_qos(text))] if is_plain else []
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return []
 

@@ -1,12 +1,7 @@
-"""Writes mcap bags, in self-contained chunks, that stay readable after a crash or on a full disk.
+"""Writes mcap bags by the package `mcap`, in small chunks, that stay readable after a crash or on a full disk.
 
-Every chunk has a checksum and repeats the channels and schemas of its messages, so that damage to another chunk or to
-the end of the file does not make it unreadable. The file on the disk ends with a complete chunk at any time: a chunk is
-written in one call, and one that does not fit is truncated again.
-
-The records are those of the package `mcap`. Its writer is not used: it writes a channel once in a file, so that a chunk
-is useless without another; and it changes its counts and index before its bytes are on the disk, so that after a full
-disk or Ctrl-C they do not match the file.
+Messages are taken by one thread and written by another, which no signal interrupts: the file stays whole whatever stops
+a recorder, and the callback that a message came by does not wait for the disk.
 
 Source: the MCAP specification, https://mcap.dev/spec.
 """
@@ -15,27 +10,23 @@ from __future__ import annotations
 
 import errno
 import os
-import struct
-import zlib
 from collections import Counter
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import yaml
-import zstandard
-from mcap import records as mcap_records
-from mcap.opcode import Opcode
+from mcap.writer import Writer
 
-from magnetosuture_thread.bags.mcap import MAGIC, RECORD_HEADER, encode_records
 from magnetosuture_thread.bags.message_types import own_definition, typestore
 from magnetosuture_thread.bags.storage import (
     METADATA_FILE,
     NOTES,
-    NOTES_PREFIX,
     QOS,
     TYPE_HASH,
     Connection,
@@ -47,64 +38,12 @@ from magnetosuture_thread.bags.storage import (
 )
 from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
 
+Message = tuple[int, int, bytes, int, int]  # arguments of `mcap.writer.Writer.add_message`
+
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
 DISK_FULL_TEXTS = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
-
-
-@dataclass
-class PendingChunk:
-    """Messages for a chunk.
-
-    What counts is a list that grows: whatever interrupts a recorder between two messages or within one, as Ctrl-C may,
-    the messages stay complete.
-
-    Attributes:
-        messages: in the order in which they came.
-        size: number of bytes of their data.
-        first: time of the first of them [ns].
-        last: time of the last of them [ns].
-    """
-
-    messages: list[mcap_records.Message] = field(default_factory=list)
-    size: int = 0
-    first: int = MAX_TIME
-    last: int = 0
-
-    @property
-    def is_full(self) -> bool:
-        """Whether the chunk is to be written."""
-        return self.size > MAX_CHUNK_BYTES or self.last - self.first > MAX_CHUNK_SPAN
-
-    def add(self, message: mcap_records.Message) -> None:
-        """Add a message."""
-        self.messages.append(message)
-        self.size += len(message.data)
-        self.first, self.last = min(self.first, message.log_time), max(self.last, message.log_time)
-
-
-@dataclass(frozen=True)
-class WriterState:
-    """What is on the disk and what is pending; replaced as one, so that no interruption leaves half of a change.
-
-    Attributes:
-        size: bytes on the disk, all of them complete records.
-        crc: their checksum.
-        chunks: number of chunks among them.
-        counts: messages in these, by channel.
-        start: time of the first of them [ns]; None if there are none.
-        end: time of the last of them [ns].
-        pending: messages for the next chunk.
-    """
-
-    size: int = 0
-    crc: int = 0
-    chunks: int = 0
-    counts: Counter[int] = field(default_factory=Counter)
-    start: int | None = None
-    end: int = 0
-    pending: PendingChunk = field(default_factory=PendingChunk)
 
 
 class BagWriter:
@@ -136,31 +75,37 @@ class BagWriter:
         self._file = folder / f"{name or folder.name}_0.mcap"
         self._notes, self._custom_data = add_checksum(notes) if notes else {}, dict(custom_data or {})
         self._topics: dict[str, int] = {}
-        self._connections: dict[int, Connection] = {}
-        self._channels: dict[int, mcap_records.Channel] = {}
-        self._schemas: dict[int, mcap_records.Schema] = {}
-        self._schema_numbers: dict[MessageDefinition, int] = {}
+        self._connections: list[Connection] = []
         self._sequences: Counter[int] = Counter()
-        self._index: list[bytes] = []  # entries of the chunk index
-        self._metadata_index: list[mcap_records.MetadataIndex] = []
-        self._compressor = zstandard.ZstdCompressor()
-        self._state = WriterState()
+        self._pending: list[Message] = []
+        self._bytes, self._first, self._last = 0, MAX_TIME, 0  # of the pending messages
+        self._defined = 0  # connections when the last chunk was begun
         self._closed = False
+        # What follows is of the thread that writes.
+        self._schemas: dict[MessageDefinition, int] = {MessageDefinition(""): 0}
+        self._registered = 0  # connections that the file has
+        self._counts: Counter[int] = Counter()
+        self._start, self._end = MAX_TIME, 0
+        self._problem: OSError | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
                 raise BagError(folder, "is not empty; a bag is written to a new folder")
-            self._stream = self._file.open("wb", buffering=0)
-        except OSError as error:
-            raise BagError(folder, f"cannot be written: {error.strerror}") from None
-        try:
-            self._state = self._append(MAGIC + encode_records(mcap_records.Header("ros2", "magnetosuture_thread")))
+            self._stream = self._file.open("wb")
+            self._mcap: Any = Writer(
+                self._stream, chunk_size=MAX_TIME, enable_data_crcs=True
+            )  # chunks end by `flush` alone
+            self._mcap.start("ros2", "magnetosuture_thread")
             if self._notes:
-                self._write_metadata(NOTES, self._notes)  # at the head of the file, where truncation leaves them
+                self._mcap.add_metadata(NOTES, self._notes)  # at the head of the file, where truncation leaves them
+            self._mcap.flush()  # type: ignore[no-untyped-call]
         except OSError as error:
-            self._stream.close()
-            self._file.unlink(missing_ok=True)  # of no use, but in the way of the next attempt
+            with suppress(OSError):
+                self._file.unlink()  # of no use, but in the way of the next attempt
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
+        self._size = self._stream.tell()
+        self._worker = ThreadPoolExecutor(1, "bag_writer")
+        self._written: Future[None] | None = None
 
     def __enter__(self) -> BagWriter:
         """Use the writer in a with statement, which closes it."""
@@ -183,28 +128,21 @@ class BagWriter:
         Raises:
             BagError: the type is unknown, and no definition is given.
         """
-        if definition is None:
-            definition = own_definition(type_name)
-            if not definition.text:
-                raise BagError(topic, f"the type {type_name} has no definition")
-        metadata = {QOS: "", TYPE_HASH: _type_hash(definition)}
-        self._topics[topic] = self.add_connection(Connection(topic, definition, metadata=metadata))
+        own = own_definition(type_name)
+        definition = definition or own
+        if not definition.text:
+            raise BagError(topic, f"the type {type_name} has no definition")
+        type_hash = typestore().hash_rihs01(type_name) if definition == own else ""
+        connection = Connection(topic, definition, metadata={QOS: "", TYPE_HASH: type_hash})
+        self._topics[topic] = self.add_connection(connection)
 
     def add_connection(self, connection: Connection) -> int:
         """Add a connection, and return its number for `write_to`."""
-        definition, schema, metadata = connection.definition, 0, dict(connection.metadata)
+        metadata = dict(connection.metadata)
         if QOS in metadata:
             metadata[QOS] = jazzy_qos_profiles(metadata[QOS])
-        if definition != MessageDefinition(""):
-            schema = self._schema_numbers.setdefault(definition, len(self._schema_numbers) + 1)
-            text = definition.text.encode("utf-8", "surrogateescape")
-            self._schemas[schema] = mcap_records.Schema(schema, text, definition.encoding, definition.type_name)
-        number = len(self._channels) + 1
-        self._connections[number] = replace(connection, metadata=metadata)
-        self._channels[number] = mcap_records.Channel(
-            number, connection.topic, connection.serialization, metadata, schema
-        )
-        return number
+        self._connections.append(replace(connection, metadata=metadata))
+        return len(self._connections)
 
     def write(self, topic: str, time: int, data: bytes) -> None:
         """Write one serialised message.
@@ -227,23 +165,29 @@ class BagWriter:
         Otherwise as `write`.
         """
         if not 0 <= time <= MAX_TIME:
-            topic = self._connections[number].topic
+            topic = self._connections[number - 1].topic
             raise BagError(topic, f"a message of the time {time} ns; expected 0 to {MAX_TIME}")
         if self._closed:
             raise BagError(self.folder, "is closed; nothing more can be written to it")
         sequence = self._sequences[number] if sequence is None else sequence
-        publish_time = time if publish_time is None else publish_time
-        self._state.pending.add(mcap_records.Message(number, time, data, publish_time, sequence))
+        self._pending.append((number, time, data, time if publish_time is None else publish_time, sequence))
         self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
-        if self._state.pending.is_full:
-            try:
-                self._flush()
-            except OSError as error:
-                self._end(error)
+        self._bytes += len(data)
+        self._first, self._last = min(self._first, time), max(self._last, time)
+        is_full = self._bytes > MAX_CHUNK_BYTES or self._last - self._first > MAX_CHUNK_SPAN
+        # Without the definition of its topic a message is lost: it comes in a chunk that is too small to be hit.
+        if is_full or number > self._defined:
+            if self._written is not None:
+                self._written.result()  # so that at most two chunks wait for the disk
+            if self._problem is not None:
+                self.close()
+            self._defined = len(self._connections)
+            self._written = self._worker.submit(self._write_chunk, self._pending)
+            self._pending, self._bytes, self._first, self._last = [], 0, MAX_TIME, 0
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
         """Serialise a message of the type store and write it; otherwise as `write`."""
-        type_name = self._connections[self._topics[topic]].type_name
+        type_name = self._connections[self._topics[topic] - 1].type_name
         self.write(topic, time, bytes(typestore().serialize_cdr(message, type_name)))
 
     def close(self) -> None:
@@ -254,176 +198,85 @@ class BagWriter:
         """
         if self._closed:
             return
-        problem: OSError | None = None
-        try:
-            self._flush()
-        except OSError as error:
-            problem = error
-        self._end(problem)
-
-    def _end(self, problem: OSError | None) -> None:
-        """Finish the bag with what is on the disk, if there is space for its summary; raise what ended it early."""
         self._closed = True
-        try:
-            self._finish()
-        except OSError as error:
-            problem = problem or error
-        finally:
-            self._stream.close()
-        if problem is not None:
-            kept = pluralize(self._state.counts.total(), "message")
-            what = DISK_FULL_TEXTS.get(problem.errno or 0, f"fails ({problem.strerror})")
+        self._worker.submit(self._finish, self._pending).result()
+        self._worker.shutdown()
+        if self._problem is not None:
+            kept = pluralize(self._counts.total(), "message")
+            what = DISK_FULL_TEXTS.get(self._problem.errno or 0, f"fails ({self._problem.strerror})")
             raise RecordingEndedError(self.folder, f"the disk {what} after {kept}", self._file) from None
 
-    def _flush(self) -> None:
-        """Write the messages so far to the disk as a chunk.
-
-        Raises:
-            OSError: they are dropped, and the file ends with the last complete chunk before them.
-        """
-        before = self._state
-        if not before.pending.messages:
+    def _write_chunk(self, pending: list[Message]) -> None:
+        """Write messages as a chunk, and take them from the list: it may come again where its owner was interrupted."""
+        messages = pending[:]
+        del pending[: len(messages)]
+        if self._problem is not None or not messages:
             return
-        content, entries = self._chunk_content(before.pending.messages)
-        times = [message.log_time for message in before.pending.messages]
-        first, last = min(times), max(times)
-        compressed = self._compressor.compress(content)
-        body = encode_records(mcap_records.Chunk("zstd", compressed, last, first, zlib.crc32(content), len(content)))
-        indices, offsets = b"", dict[int, int]()
-        for channel, messages in entries.items():
-            offsets[channel] = before.size + len(body) + len(indices)
-            indices += encode_records(mcap_records.MessageIndex(channel, messages))
-        entry = mcap_records.ChunkIndex(
-            chunk_length=len(body),
-            chunk_start_offset=before.size,
-            compression="zstd",
-            compressed_size=len(compressed),
-            message_end_time=last,
-            message_index_length=len(indices),
-            message_index_offsets=offsets,
-            message_start_time=first,
-            uncompressed_size=len(content),
-        )
         try:
-            after = self._append(body + indices)
-        except OSError:
-            self._state = replace(before, pending=PendingChunk())
-            raise
-        del self._index[before.chunks :]  # left there by an interruption
-        self._index.append(encode_records(entry))
-        self._state = replace(
-            after,
-            chunks=before.chunks + 1,
-            counts=before.counts + Counter({channel: len(messages) for channel, messages in entries.items()}),
-            start=first if before.start is None else min(before.start, first),
-            end=max(before.end, last),
-            pending=PendingChunk(),
-        )
+            self._register()
+            for message in messages:
+                self._mcap.add_message(*message)
+            self._mcap.flush()
+            self._size = self._stream.tell()
+        except OSError as error:
+            self._fail(error)
+            return
+        self._counts.update(message[0] for message in messages)
+        times = [message[1] for message in messages]
+        self._start, self._end = min(self._start, *times), max(self._end, *times)
 
-    def _chunk_content(self, messages: list[mcap_records.Message]) -> tuple[bytes, dict[int, list[tuple[int, int]]]]:
-        """Return the records of a chunk, with the channels and schemas of its messages; and time and offset of each."""
-        content = bytearray()
-        entries: dict[int, list[tuple[int, int]]] = {}
-        defined: set[int] = set()
-        for message in messages:
-            if message.channel_id not in entries:
-                channel = self._channels[message.channel_id]
-                if channel.schema_id and channel.schema_id not in defined:
-                    content += encode_records(self._schemas[channel.schema_id])
-                    defined.add(channel.schema_id)
-                content += encode_records(channel)
-                entries[message.channel_id] = []
-            entries[message.channel_id].append((message.log_time, len(content)))
-            content += encode_records(message)
-        return bytes(content), entries
+    def _register(self) -> None:
+        """Write the connections that were added since the last chunk."""
+        for connection in self._connections[self._registered :]:
+            definition = connection.definition
+            if definition not in self._schemas:
+                text = definition.text.encode("utf-8", "surrogateescape")
+                self._schemas[definition] = self._mcap.register_schema(definition.type_name, definition.encoding, text)
+            schema, metadata = self._schemas[definition], dict(connection.metadata)
+            self._mcap.register_channel(connection.topic, connection.serialization, schema, metadata)
+            self._registered += 1
 
-    def _finish(self) -> None:
-        """Write the summary and metadata.yaml.
-
-        Raises:
-            OSError: the file ends with the last complete chunk.
-        """
-        information, chunks = self._information(), self._state
+    def _finish(self, pending: list[Message]) -> None:
+        """Write the last chunk, the summary and metadata.yaml."""
+        self._write_chunk(pending)
+        if self._problem is not None:
+            return
         try:
-            self._write_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)})
-            self._state = self._append(encode_records(mcap_records.DataEnd(self._state.crc)))
-            self._state = self._append(self._summary())
+            self._register()
+            information = self._information()
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)})
+            self._mcap.finish()
+            self._stream.flush()
             os.fsync(self._stream.fileno())
-        except OSError:
-            self._state = chunks
-            self._truncate()
-            raise
+            self._stream.close()
+        except OSError as error:
+            self._fail(error)
+            return
         text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
         try:
             with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:
                 stream.write(text)
                 stream.flush()
                 os.fsync(stream.fileno())
-        except OSError:  # a part of it would be refused, where readers do without it
+        except OSError as error:  # a part of it would be refused, where readers do without it
             (self.folder / METADATA_FILE).unlink(missing_ok=True)
-            raise
+            self._problem = error
 
-    def _write_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        record = encode_records(mcap_records.Metadata(name, dict(entries)))
-        entry = mcap_records.MetadataIndex(self._state.size, len(record), name)
-        self._state = self._append(record)
-        self._metadata_index.append(entry)
-
-    def _append(self, data: bytes) -> WriterState:
-        """Write all of the data or nothing, and return the new state."""
-        self._truncate()  # an interruption may have left something
-        try:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[self._stream.write(rest) :]
-        except OSError:
-            self._truncate()
-            raise
-        return replace(self._state, size=self._state.size + len(data), crc=zlib.crc32(data, self._state.crc))
-
-    def _truncate(self) -> None:
-        self._stream.seek(self._state.size)
-        self._stream.truncate()
-
-    def _summary(self) -> bytes:
-        """Return all records after the data end."""
-        data, at = b"", self._state.size
-        offsets = b""
-        statistics = mcap_records.Statistics(
-            attachment_count=0,
-            channel_count=len(self._channels),
-            channel_message_counts=dict(self._state.counts),
-            chunk_count=self._state.chunks,
-            message_count=self._state.counts.total(),
-            message_end_time=self._state.end,
-            message_start_time=self._state.start or 0,
-            metadata_count=len(self._metadata_index),
-            schema_count=len(self._schemas),
-        )
-        for opcode, group in (
-            (Opcode.SCHEMA, encode_records(*self._schemas.values())),
-            (Opcode.CHANNEL, encode_records(*self._channels.values())),
-            (Opcode.STATISTICS, encode_records(statistics)),
-            (Opcode.CHUNK_INDEX, b"".join(self._index[: self._state.chunks])),
-            (Opcode.METADATA_INDEX, encode_records(*self._metadata_index)),
-        ):
-            if group:
-                offsets += encode_records(mcap_records.SummaryOffset(opcode, at + len(data), len(group)))
-                data += group
-        footer = (at, at + len(data))
-        data += offsets
-        crc = zlib.crc32(RECORD_HEADER.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", *footer), zlib.crc32(data))
-        return data + encode_records(mcap_records.Footer(*footer, crc)) + MAGIC
+    def _fail(self, problem: OSError) -> None:
+        """End the file with the last complete chunk."""
+        self._problem = problem
+        with suppress(OSError):
+            self._stream.close()  # which tries to write the rest
+        os.truncate(self._file, self._size)
 
     def _information(self) -> dict[str, Any]:
         """Return the content of metadata.yaml."""
-        state = self._state
-        notes = {NOTES_PREFIX + key: value for key, value in self._notes.items()}
-        part = {
-            "starting_time": {"nanoseconds_since_epoch": state.start or 0},
-            "duration": {"nanoseconds": state.end - (state.start or 0)},
-            "message_count": state.counts.total(),
+        start = self._start if self._counts else 0
+        times = {
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "duration": {"nanoseconds": self._end - start},
         }
+        count = self._counts.total()
         topics = [
             {
                 "topic_metadata": {
@@ -433,26 +286,20 @@ class BagWriter:
                     "offered_qos_profiles": parse_qos_profiles(connection.metadata.get(QOS, "")),
                     "type_description_hash": connection.metadata.get(TYPE_HASH, ""),
                 },
-                "message_count": state.counts[number],
+                "message_count": self._counts[number],
             }
-            for number, connection in self._connections.items()
+            for number, connection in enumerate(self._connections, 1)
         ]
         return {
             "version": 9,  # of the format of metadata.yaml
             "storage_identifier": "mcap",
-            **part,
+            **times,
+            "message_count": count,
             "topics_with_message_count": topics,
             "compression_format": "",
             "compression_mode": "",
             "relative_file_paths": [self._file.name],
-            "files": [{"path": self._file.name, **deepcopy(part)}],  # a copy, as YAML would write aliases
-            "custom_data": {**self._custom_data, **notes},
+            "files": [{"path": self._file.name, **deepcopy(times), "message_count": count}],  # YAML would write aliases
+            "custom_data": {**self._custom_data, **{f"{NOTES}.{key}": text for key, text in self._notes.items()}},
             "ros_distro": "jazzy",
         }
-
-
-def _type_hash(definition: MessageDefinition) -> str:
-    """Return the RIHS01 hash of a type, where its definition is ours."""
-    if definition != own_definition(definition.type_name) or not definition.text:
-        return ""
-    return typestore().hash_rihs01(definition.type_name)

@@ -133,7 +133,7 @@ def _read_run(path: Path, bag: BagInput, settings: ThreadModelSettings, against:
         if problem := observations.thread_problem():
             raise BagError(path, problem) from None
         raise
-    return replace(run, unverified=bag.recording.unverified)
+    return replace(run, unverified=bag.recording.salvaged_without_checksum)
 
 
 def thread_settings(setup: Setup, material: str = "", formulation: str = "") -> ThreadModelSettings:

@@ -50,7 +50,7 @@ def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     for line in _lines(found):
         terminal.log(line)
     command.write_json(options.json, found)
-    return command.FAILED if found["damage"] or found["refused"] or found["unverified"] else command.DONE
+    return command.FAILED if found["damage"] or found["refused"] or found["salvaged_without_checksum"] else command.DONE
 
 
 def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> int:
@@ -68,7 +68,7 @@ def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> int:
             name = options.output.name
             report = write_repaired_bag(bag, folder, name, lambda share: advance(0.5 + 0.5 * share))
     places = bag.damage.regions if bag.damage is not None else ()
-    doubts = [str(bag.damage or ""), f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks]
+    doubts = [str(bag.damage or ""), bag.salvaged_without_checksum or bag.has_no_checksum, *bag.remarks]
     lines = [line for line in doubts if line]
     if report.is_same and not lines:
         lines.append("is not damaged: the new bag holds the same messages, definitions and notes")
@@ -136,13 +136,13 @@ def _lines(found: dict[str, Any]) -> Iterator[str]:
     for key, value in found["notes"].items():
         yield f"{key}: {shorten(value, 200, placeholder=' ...')}"
     yield from found["remarks"]
-    if found["unverified"] or found["unchecked"]:
-        yield f"unverified: {found['unverified']}" if found["unverified"] else found["unchecked"]
+    doubt = found["salvaged_without_checksum"] or found["has_no_checksum"]
+    if doubt:
+        yield doubt
     for reason, count in found["refused"].items():
         yield f"{reason}: {pluralize(count, 'message')} lost"
     if found["damage"] is not None:
         yield found["damage"]["text"]
-        byte = "{file}, bytes {start_byte} to {end_byte}: {what}"
-        yield from _shown([byte.format(**place) for place in found["damage"]["places"]])
-    elif not (found["refused"] or found["unchecked"] or found["unverified"]):
+        yield from _shown([place["text"] for place in found["damage"]["places"]])
+    elif not (found["refused"] or doubt):
         yield "nothing is damaged"

@@ -226,7 +226,7 @@ def _evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[R
             formulation=model.formulation,
             duration_s=bag.duration,
             damage="; ".join(str(region) for region in recording.damage.regions) if recording.damage else "",
-            unverified=recording.unverified,
+            unverified=recording.salvaged_without_checksum,
             refused=sum(count for why, count in run.refused.items() if why != NOT_FOUND),
         )
         return row, draw_run(bag, run.metrics, log) if task.is_drawn else b""

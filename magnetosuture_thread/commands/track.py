@@ -234,7 +234,7 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
         recording, camera = _open_recording(Bag(path, remap=dict(options.remap)), log)
         if recording.rectified and lens is not None:
             raise BagError(path, f"has rectified frames on {recording.rectified}; omit --camera-info")
-        source.count, source.unverified = recording.counts[camera.recorded], recording.unverified
+        source.count, source.unverified = recording.counts[camera.recorded], recording.salvaged_without_checksum
         source.rate = partial(_median_rate, recording, camera)
         source.frames = _recorded(source, recording, camera, lens)
     elif is_video:
@@ -255,7 +255,7 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
 def _open_recording(bag: Bag, log: Log) -> tuple[Recording, Channel]:
     """Return a bag with its camera, and log what is unusual about it."""
     recording = Recording(bag)
-    doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
+    doubt = f"is unverified: {bag.salvaged_without_checksum}" if bag.salvaged_without_checksum else bag.has_no_checksum
     for line in (str(bag.damage or ""), doubt, *recording.remarks):
         if line:
             log(f"{recording.path} {line}")

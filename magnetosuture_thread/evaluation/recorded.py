@@ -30,7 +30,7 @@ from magnetosuture_thread.bags.reading import (
 )
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.scene_message import parse_scene_message
-from magnetosuture_thread.bags.storage import UNVERIFIED_NOTE
+from magnetosuture_thread.bags.storage import SALVAGED_NOTE
 from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
@@ -446,7 +446,11 @@ class BagInput:
     @property
     def notes(self) -> dict[str, str]:
         """Return the notes of a bag made from this one."""
-        own = {UNVERIFIED_NOTE: self.recording.unverified} if self.recording.unverified else {}
+        own = (
+            {SALVAGED_NOTE: self.recording.salvaged_without_checksum}
+            if self.recording.salvaged_without_checksum
+            else {}
+        )
         return {**self.recording.notes, **own, "setup": self.setup.name, "replayed": str(self.recording.path)}
 
     def observations(self, progress: Progress = lambda share: None) -> ObservationReader:
@@ -504,10 +508,10 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     )
     if recording.damage is not None:
         log(f"the bag is damaged, what is intact is played: {recording.damage}")
-    if recording.unverified:
-        log(f"unverified: {recording.unverified}")
-    elif recording.unchecked and recording.damage is None:
-        log(recording.unchecked)
+    if recording.salvaged_without_checksum:
+        log(f"unverified: {recording.salvaged_without_checksum}")
+    elif recording.has_no_checksum and recording.damage is None:
+        log(recording.has_no_checksum)
     for remark in recording.remarks:
         log(remark)
     if not 0.0 <= start <= recording.duration:

@@ -252,7 +252,7 @@ def replay_summary(bag: BagInput, metrics: RunMetrics, **others: Any) -> ReplayS
         needle_pull=finite_or_none(metrics.maximum("pull")),
         source=bag.source,
         damage=str(bag.recording.damage or ""),
-        unverified=bag.recording.unverified,
+        unverified=bag.recording.salvaged_without_checksum,
         estimation=metrics.estimation,
         **figures_of(metrics),
         **others,

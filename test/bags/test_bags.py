@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 
 from magnetosuture_thread.bags.message_types import DecoderCache, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.bags.storage import Budget, MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
@@ -70,6 +70,8 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
         (tmp_path / "two" / f"{name}.mcap").write_bytes(good.read_bytes())
     (tmp_path / "ros1").mkdir()
     (tmp_path / "ros1" / "a.bag").write_bytes(b"#ROSBAG V2.0\n" * 9)
+    database = write_rosbag(tmp_path / "db", StoragePlugin.SQLITE3, texts(500), {"/text": STRING}) / "db.db3"
+    broken = database.read_bytes()[:-4096] + b"\xff" * 4096
     with BagWriter(tmp_path / "hollow") as bag:
         bag.add_topic("/one", HEADER)
     for name, content, words in (
@@ -85,7 +87,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
         ("text.mcap", b"not a bag, but long enough to be one", "is no mcap file"),
         ("empty.db3", b"", "is empty"),
         ("text.db3", b"text" * 99, "is no sqlite3"),
-        ("broken.db3", b"SQLite format 3\0" * 9, "is damaged"),
+        ("broken.db3", broken, "is damaged"),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
@@ -93,6 +95,7 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
             Bag(tmp_path / name)
         assert words in str(caught.value)
         assert name in str(caught.value)
+        assert "\n" not in str(caught.value)
 
 
 PLUGINS = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
@@ -114,7 +117,7 @@ def test_bags_of_rosbag2_are_read(tmp_path: Path, plugin: StoragePlugin):
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     assert (bag.topics, bag.counts) == (TYPES, {"/text": 200, "/header": 200})
     assert bag.damage is None
-    assert "no checksums" in bag.unchecked
+    assert "no checksums" in bag.has_no_checksum
     assert [r.decode().data for r in bag.records({"/text"}, start=1.0, duration=0.02)] == [
         "text 100",
         "text 101",
@@ -148,9 +151,27 @@ def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
     assert damage is not None
     said = "\n".join(map(str, damage.regions))
     assert "split_4.mcap" in said
-    assert "split_5.mcap, byte 0: is empty" in said
-    assert ("split_6.mcap, byte 0: it is missing" in said) == named
+    assert "split_5.mcap is empty" in said
+    assert ("split_6.mcap is missing" in said) == named
     assert Bag(folder).counts["/text"] >= 160
+
+
+@pytest.mark.parametrize("has_metadata", [True, False])
+def test_parts_that_are_compressed_as_a_whole_are_named(tmp_path: Path, has_metadata: bool):
+    """As `ros2 bag record --compression-mode file` leaves them after a crash, and `ros2 bag play` after some parts."""
+    names = [f"run_{part}.mcap" for part in range(3)]
+    for part, name in enumerate(names):
+        file = write_mcap(tmp_path / name, texts(20, start=(1 + part) * 10**9), {"/text": STRING})
+        (tmp_path / f"{name}.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+    (tmp_path / names[1]).unlink()
+    if has_metadata:
+        lines = "".join(f"  - {name}.zstd\n" for name in names)
+        (tmp_path / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{lines}")
+    bag = Bag(tmp_path)
+    assert bag.counts == {"/text": 40}
+    assert bag.damage is not None
+    advice = "run_1.mcap.zstd is compressed as a whole; decompress it first: zstd -d run_1.mcap.zstd"
+    assert [str(region) for region in bag.damage.regions] == [advice]
 
 
 def test_the_bags_own_definitions_are_taken(tmp_path: Path):
@@ -179,7 +200,7 @@ POINT = "geometry_msgs/msg/Point"
 def test_definitions_in_idl_are_taken(fields: str, is_ours: bool):
     """Ours is not used in the place of one that differs."""
     text = f"module geometry_msgs {{ module msg {{ struct Point {{ {fields} }}; }}; }};"
-    decoder = DecoderCache().decoder_of(MessageDefinition(POINT, "ros2idl", text))
+    decoder = DecoderCache(Budget("bag", 0)).decoder_of(MessageDefinition(POINT, "ros2idl", text))
     assert decoder.is_ours == is_ours
     if is_ours:
         point = decoder.decode("/point", b"\0\1\0\0" + struct.pack("<3d", 1.0, 2.0, 3.0))

@@ -128,12 +128,15 @@ def test_every_kind_of_thread(tmp_path: Path, message: Any):
     assert found.header.frame_id == "dish"
 
 
-def test_a_marker_that_is_no_line_is_refused_and_counted(tmp_path: Path):
-    topic = MEASURED_THREAD.recorded
-    bag = bag_of(tmp_path, (topic, marker()), (topic, marker(kind=5)), (topic, marker(action=2)))
-    recording = Recording(bag)
+def test_a_marker_that_is_no_line_or_nowhere_is_refused_and_counted(tmp_path: Path):
+    markers = [marker(), marker(kind=5), marker(action=2), marker(), marker()]
+    markers[3].pose.position.y, markers[4].pose.position.y = math.nan, math.inf
+    recording = Recording(bag_of(tmp_path, *((MEASURED_THREAD.recorded, message) for message in markers)))
     assert len(list(recording.records([MEASURED_THREAD]))) == 1
-    assert recording.refused == {"/thread/measured: a marker that is no line strip being added": 2}
+    assert recording.refused == {
+        "/thread/measured: a marker that is no line strip being added": 2,
+        "/thread/measured: a place that is not finite": 2,
+    }
 
 
 def image(channel: Any) -> Any:
@@ -231,15 +234,6 @@ def test_what_is_infinite_spoils_nothing_beside_it(tmp_path: Path):
     assert np.array_equal(only(Recording(bag), NEEDLE_POSE).pose.covariance.reshape(6, 6), variances)
     twist = only(Recording(bag), NEEDLE_COMMAND).twist
     assert [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.x] == [math.inf, 2.0, 3.0, 1.0]
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_marker_at_no_finite_place_is_refused_and_counted(tmp_path: Path, value: float):
-    astray = marker()
-    astray.pose.position.y = value
-    recording = Recording(bag_of(tmp_path, (MEASURED_THREAD.recorded, astray)))
-    assert list(recording.records([MEASURED_THREAD])) == []
-    assert recording.refused == {"/thread/measured: a place that is not finite": 1}
 
 
 @pytest.mark.parametrize("frame", ["camera_link", ""])

@@ -78,7 +78,9 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
     bag = Bag(folder)
     assert bag.damage is not None
     assert "truncated" in str(bag.damage)
-    assert bag.counts["/noise"] >= said - 7  # a chunk holds seven
+    assert (
+        bag.counts["/noise"] >= said - 16
+    )  # a chunk holds seven or eight: one is filled, one is on its way to the disk
     assert [time for _, time, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
 
 
