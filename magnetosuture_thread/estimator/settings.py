@@ -182,7 +182,7 @@ class ThreadModelSettings(
         if self.friction_threshold > self.margin_range:
             raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
         if 0.0 < self.elastic_modulus < MIN_ELASTIC_MODULUS:
-            words = f"at least {MIN_ELASTIC_MODULUS:g} Pa, as of silicone rubber, or 0 for the material's"
+            words = f"at least {MIN_ELASTIC_MODULUS:g} Pa, or 0 for the material's; the softest materials have 1 MPa"
             raise self.refused("elastic_modulus", words)
         diameter, segments = self._material().diameter, self.segments
         if self.thread_length / segments <= diameter:

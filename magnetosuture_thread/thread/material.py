@@ -22,7 +22,7 @@ DIAMETER = bounded("m", 1e-6, 0.01)
 VISCOSITY = bounded("Pa s", 1e-6, 1e4)
 DRAG = bounded("Pa s", 0.0, 1e6)
 SHARE = bounded("", 1e-3, 1.0)
-MIN_ELASTIC_MODULUS = 1e6  # Pa; of silicone rubber, softer than any suture material
+MIN_ELASTIC_MODULUS = 1e5  # Pa; a tenth of the softest materials': filaments of a braid slide when it is bent
 MAX_ELASTIC_MODULUS = 1e12  # Pa; of diamond, stiffer than any wire
 MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
