@@ -16,20 +16,12 @@ from magnetosuture_thread.estimator import association, noise
 from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
-from magnetosuture_thread.estimator.stiffness import (
-    AUTOMATIC,
-    STIFFNESS_OVER_DRAG,
-    LearnedState,
-    SlowParameter,
-    StiffnessLearner,
-)
 from magnetosuture_thread.geometry.barrier import BUILT_IN, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import SOLID, Margins
-from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
@@ -49,21 +41,12 @@ class EstimatorOptions:
 
     Attributes:
         history: how late an observation may come [s].
-        slow_parameters: what is learned of the thread on line: nothing, `stiffness_over_drag`, or `auto`: stiffness
-            over drag, from the first time on that the thread moves as the model cannot explain.
 
     Raises:
-        ConfigurationError: a value is out of bounds, or a parameter is unknown.
+        ConfigurationError: it is out of bounds.
     """
 
     history: Annotated[float, bounded("s", 1e-3, 1e5)] = 1.0
-    slow_parameters: tuple[str, ...] = (AUTOMATIC,)
-
-    def __post_init__(self) -> None:
-        """Check the names."""
-        if self.slow_parameters not in ((), (AUTOMATIC,), (STIFFNESS_OVER_DRAG,)):
-            expected = f"{STIFFNESS_OVER_DRAG} or {AUTOMATIC} alone, or nothing"
-            raise ConfigurationError("estimator.slow_parameters", list(self.slow_parameters), expected)
 
 
 @dataclass(frozen=True)
@@ -85,8 +68,6 @@ class ThreadEstimate:
         noise: intensity of the process noise in each window, shape (w,) [m^2/s].
         disturbances: what the model does not know.
         problems: why pieces or the whole observation were refused.
-        slow_parameters: what is learned of thread and liquid; empty if nothing is asked for.
-        thread: with what is learned.
         compute_margins: at its positions.
     """
 
@@ -104,8 +85,6 @@ class ThreadEstimate:
     noise: Vector
     disturbances: tuple[Disturbance, ...]
     problems: tuple[str, ...]
-    slow_parameters: tuple[SlowParameter, ...]
-    thread: Thread
     compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
 
     @property
@@ -166,8 +145,8 @@ class FilterState:
     prediction: Prediction | None = None
 
 
-Snapshot = tuple[FilterState, NeedlePose | None, ThreadState | None, WarmStart, LearnedState]
-"""Everything that the next step depends on: of the filter, predictor, formulation and stiffness."""
+Snapshot = tuple[FilterState, NeedlePose | None, ThreadState | None, WarmStart]
+"""Everything that the next step depends on: of the filter, predictor and formulation."""
 
 
 class ThreadEstimator:
@@ -200,11 +179,9 @@ class ThreadEstimator:
         # The model's errors are alike over a tenth of the length.
         self._length = max(0.1 * self.thread.segments, 0.5)  # l [D]
         self._corrector = Corrector(predictor, formulation)
-        self._stiffness = StiffnessLearner(predictor, formulation, self.options.slow_parameters)
         self._forget()
 
     def _forget(self) -> None:
-        self._stiffness.reset()
         errors = np.zeros((2, self.thread.segments + 1))
         self._now = FilterState(errors, NoiseModel.new(), DisturbanceTest(self.thread))
 
@@ -275,7 +252,7 @@ class ThreadEstimator:
             SolverError: see `ThreadPredictor.step`.
         """
         before, now = self.predictor.state, self._now
-        now.prediction = prediction = self._stiffness.step(pose)
+        now.prediction = prediction = self.predictor.step(pose)
         now.converged = prediction.converged
         assert before is not None
         intensity = noise.at_nodes(now.noise.intensity, self.thread.segments + 1)
@@ -297,13 +274,7 @@ class ThreadEstimator:
         points, refused = self._points_of(placed, state)
         if points is None:
             return self._estimate(problems + refused)
-        learner, corrector, work = self._stiffness, self._corrector, self._corrector.work
-        if learner.state.active:
-            noise.weigh(points, now.errors[0])
-            if not corrector.solve(self._prior(state, pose), points):
-                state = learner.learn(corrector, state, pose.stamp)
-                again, refused = self._points_of(placed, state)
-                points = again or points
+        corrector, work = self._corrector, self._corrector.work
         problems, count = problems + refused, len(points.place)
         measured = math.isfinite(now.measured_at)
         elapsed = pose.stamp - now.measured_at if measured else 0.0
@@ -316,8 +287,6 @@ class ThreadEstimator:
         normals = normals_of(prior.positions)
         now.errors, applied, hidden = noise.take_correction(points, normals, work.moved, work.covariance, prior.density)
         now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
-        if learner.state.active:
-            learner.correct(corrector, float(now.errors[0].mean()))
         if measured:  # else there is no earlier time to compare with
             # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
             # points of a window share it, and so do both times that the test compares.
@@ -375,7 +344,6 @@ class ThreadEstimator:
         now.gross, now.unknown, now.converged = 0, False, False
         now.errors = self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance)))
         now.noise, now.test = NoiseModel.new(), DisturbanceTest(self.thread)
-        self._stiffness.restart()
         return laid
 
     def _estimate(
@@ -401,9 +369,6 @@ class ThreadEstimator:
             covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
         formulation.added.set_time(pose.stamp)
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
-        disturbances = now.test.found(pose.stamp, positions)
-        if corrected and disturbances:
-            self._stiffness.activate()
 
         def compute_margins() -> Margins:
             rows = [*formulation.margins(positions, pose.heading), *added]
@@ -424,39 +389,34 @@ class ThreadEstimator:
             hidden=1.0 if hidden is None else hidden,
             innovations=innovations,
             noise=now.noise.intensity,
-            disturbances=disturbances,
+            disturbances=now.test.found(pose.stamp, positions),
             problems=tuple(problems),
-            slow_parameters=self._stiffness.report(),
-            thread=self._stiffness.thread,
             compute_margins=compute_margins,
         )
 
     def snapshot(self) -> Snapshot:
         """Return everything that the next step depends on."""
         now, predictor = replace(self._now, test=copy(self._now.test)), self.predictor
-        return now, predictor.pose, predictor.state, self._formulation.warm_start(), self._stiffness.state
+        return now, predictor.pose, predictor.state, self._formulation.warm_start()
 
     def restore(self, kept: Snapshot) -> None:
         """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
-        now, self.predictor.pose, self.predictor.state, warm_start, learned = kept
+        now, self.predictor.pose, self.predictor.state, warm_start = kept
         self._now = replace(now, test=copy(now.test))
         self._formulation.restore(warm_start)
-        self._stiffness.restore(learned)
 
     def follow_on(self, other: ThreadEstimator) -> None:
         """Continue from the estimate of another thread, in another scene or with other options; a step comes next.
 
-        What was learned of the stiffness and added up for disturbances stays with the thread that it is of.
+        What was added up for disturbances stays with the thread that it is of.
         """
         self.reset()
         self.predictor.follow_on(other.predictor)
-        (kept, *_, learned), (old, new) = other.snapshot(), (other._unit, self._unit)
+        kept, old, new = other.snapshot()[0], other._unit, self._unit
         at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
         errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
         test = kept.test if self.thread == other.thread else self._now.test
         self._now = replace(kept, errors=errors, test=test, prediction=None)
-        if self.thread == other.thread and self.options.slow_parameters == other.options.slow_parameters:
-            self._stiffness.restore(learned)
 
 
 def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:

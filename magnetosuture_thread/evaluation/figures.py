@@ -174,9 +174,6 @@ def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
     ]
     if estimation.hidden is not None:
         found.append(_consistency(estimation.consistency))
-    for parameter in estimation.learned:
-        value, range_95 = str(parameter).split(", ", 1)
-        found.append(Headline(parameter.name.replace("_", " "), value, range_95, "none", "learned by the estimate"))
     return [*found, _frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.estimator import Disturbance, SlowParameter, ThreadEstimate
+from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
@@ -77,7 +77,6 @@ class EstimatedThread:
         squared: normalised innovation squared of each window of arc length, shape (w,); nan where nothing is measured.
         disturbances: what the model does not know.
         hidden: part of the thread that no point shows, 0 to 1.
-        learned: slow parameters, where any are learned.
     """
 
     vertices: Points
@@ -85,14 +84,12 @@ class EstimatedThread:
     squared: Array = field(default_factory=_nothing)
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
-    learned: tuple[SlowParameter, ...] = ()
 
     @classmethod
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
         squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        learned = estimate.slow_parameters
-        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden, learned)
+        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
 
 
 @dataclass(kw_only=True)

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from magnetosuture_thread.estimator import SlowParameter
-from magnetosuture_thread.estimator.stiffness import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.evaluation.frames import (
     MIN_DISTANCE,
     SILENT_PERIODS,
@@ -411,14 +409,12 @@ class EstimationFigures:
         consistency: of the innovations; None where no measurement went in.
         hidden: how much of the thread was hidden; None where nothing was estimated.
         disturbances: what the model does not know, by its beginning.
-        learned: slow parameters in the end, where any are learned.
     """
 
     corrected: int = 0
     consistency: Consistency | None = None
     hidden: HiddenShares | None = None
     disturbances: tuple[DisturbanceEvent, ...] = ()
-    learned: tuple[SlowParameter, ...] = ()
 
     @property
     def estimated(self) -> bool:
@@ -428,7 +424,6 @@ class EstimationFigures:
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none."""
         hidden, found = self.hidden, self.consistency
-        learned = self.learned[0] if self.learned else None
         return {
             "corrected_frames": self.corrected,
             "consistency": {
@@ -444,11 +439,6 @@ class EstimationFigures:
             "all_hidden_time_share": hidden.all_time if hidden else None,
             "hidden_length_share": hidden.length if hidden else None,
             "disturbances": len(self.disturbances),
-            "learned": {
-                STIFFNESS_OVER_DRAG: learned.value if learned else None,
-                f"{STIFFNESS_OVER_DRAG}_95_low": learned.low if learned else None,
-                f"{STIFFNESS_OVER_DRAG}_95_high": learned.high if learned else None,
-            },
         }
 
 
@@ -472,7 +462,6 @@ class RunMetrics:
         reasons: why not.
         contact_frames: those in which the thread touches an obstacle or the wall.
         disturbances: that the estimate reported; those with one beginning are one event.
-        learned: slow parameters of the last estimate that has any.
         series: columns of all frames with a prediction, by time.
     """
 
@@ -486,7 +475,6 @@ class RunMetrics:
         self.lost: list[list[float]] = []
         self.reasons: Counter[str] = Counter()
         self.disturbances: list[DisturbanceEvent] = []
-        self.learned: tuple[SlowParameter, ...] = ()
         self._length, self._start = length, start
         self._found, self._disturbed_since = True, math.nan
         self._minimum: dict[str, MinimumMargin] = {}
@@ -516,8 +504,6 @@ class RunMetrics:
             self.contact_frames += bool(frame.margins.in_contact)
             self._lower(time, frame.margins)
         self._take_disturbances(time, frame)
-        if frame.estimate is not None and frame.estimate.learned:
-            self.learned = frame.estimate.learned
         columns = frame.columns() | {"hidden": hidden_part(frame, self._length)} | self._compare(time, frame)
         self.series.add(time, columns)
 
@@ -621,7 +607,7 @@ class RunMetrics:
         """What the run tells of its estimate beside the errors."""
         corrected = int(np.nansum(self.series.column("corrected")))
         consistency, hidden = Consistency.of(self.series), HiddenShares.of(self.series)
-        return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances), self.learned)
+        return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances))
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""

@@ -353,9 +353,6 @@ def _estimation(estimation: EstimationFigures) -> list[Line]:
     within = f"{low:.2f} to {high:.2f} in {found.within} of {found.windows} windows of {found.width:.1f} s"
     lines.append(("normalised innovation squared", f"{found.mean:.3f}", within))
     lines.append(("disturbances", str(len(estimation.disturbances)), "that the model does not know"))
-    for parameter in estimation.learned:
-        value, interval = str(parameter).split(", ", 1)
-        lines.append((f"learned {parameter.name}", value, interval))
     return lines
 
 

@@ -455,8 +455,22 @@ class RodFormulation(Formulation):
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
         self._buffers = RodBuffers.of(self._program, self.dimension)
-        self._bands = mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED)
-        self.rod = self.rod_of(thread)
+        medium = thread.medium
+        self.rod = RodProperties(
+            thread.attachment is Attachment.CLAMPED,
+            thread.segment_length,
+            self._radius,
+            thread.bending_stiffness,
+            medium.drag_across,
+            medium.drag_along,
+            medium.mass_per_length,
+            medium.bending_damping,
+            self._vector("gravity", medium.gravity),
+            np.ascontiguousarray(thread.rest_angles),
+            mechanics.end_corrected_weights(thread.segments),
+            mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED),
+            self._vector("flow", medium.flow),
+        )
         first = solver.first if type(solver) is FallbackSolver else solver
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
@@ -482,33 +496,6 @@ class RodFormulation(Formulation):
         """Forget the last solve; see `Formulation`."""
         super().forget()
         self._buffers.grips.shape[:], self._buffers.grips.force[:] = NO_SHAPE, 0.0
-
-    def set_thread(self, thread: Thread) -> None:
-        """Change stiffness, rest curvature and medium from the next step on; the chain itself stays as it is.
-
-        Args:
-            thread: of the same length, segments, diameter and attachment.
-        """
-        self._thread, self.rod = thread, self.rod_of(thread)
-
-    def rod_of(self, thread: Thread) -> RodProperties:
-        """Return a thread that differs in stiffness, rest curvature and medium, for compiled code."""
-        medium = thread.medium
-        return RodProperties(
-            thread.attachment is Attachment.CLAMPED,
-            thread.segment_length,
-            self._radius,
-            thread.bending_stiffness,
-            medium.drag_across,
-            medium.drag_along,
-            medium.mass_per_length,
-            medium.bending_damping,
-            self._vector("gravity", medium.gravity),
-            np.ascontiguousarray(thread.rest_angles),
-            mechanics.end_corrected_weights(thread.segments),
-            self._bands,
-            self._vector("flow", medium.flow),
-        )
 
     def _vector(self, name: str, values: tuple[float, ...]) -> Vector:
         """Return a vector of the medium, zeros where it has none."""
