@@ -1,13 +1,12 @@
 """Compiles the kernels that each process of the tests would compile by itself, or hands compiled ones on.
 
-With a folder, that of the package as it is installed elsewhere, the kernels of this tree are copied there: numba takes
-them for a file of the same content and time of change. Else they are compiled.
+With a folder, that of the package as it is installed elsewhere, the kernels of this tree are copied there: they are
+those of files of the same content. Else they are compiled.
 """
 
 from __future__ import annotations
 
 import filecmp
-import os
 import shutil
 import subprocess
 import sys
@@ -47,9 +46,7 @@ def copy_kernels(package: Path) -> None:
         installed = package / source.relative_to(PACKAGE)
         if not installed.exists() or not filecmp.cmp(source, installed, shallow=False):
             sys.exit(f"{installed}: expected a copy of {source}")
-        status = source.stat()
-        os.utime(installed, ns=(status.st_atime_ns, status.st_mtime_ns))
-    for kernel in [*PACKAGE.rglob("__pycache__/*.nb[ci]"), PACKAGE / "__pycache__" / "kernels.json"]:
+    for kernel in PACKAGE.rglob("__pycache__/*.nb[ci]"):
         copy = package / kernel.relative_to(PACKAGE)
         copy.parent.mkdir(exist_ok=True)
         shutil.copy2(kernel, copy)

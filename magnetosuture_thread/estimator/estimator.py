@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,11 @@ from magnetosuture_thread.estimator import association, noise
 from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
-from magnetosuture_thread.geometry.barrier import BUILT_IN, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.thread.margins import SOLID, Margins
+from magnetosuture_thread.thread.margins import SOLID, BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
@@ -87,6 +86,10 @@ class ThreadEstimate:
     problems: tuple[str, ...]
     compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything computed, for `copy` and `pickle`."""
+        return {**self.__dict__, "margins": self.margins, "compute_margins": None}
+
     @property
     def stamp(self) -> float:
         """Of the needle's pose [s]."""
@@ -98,7 +101,9 @@ class ThreadEstimate:
         return self.compute_margins()
 
 
-def clearance_bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
+def clearance_bound(
+    nodes: NDArray[Any], gradient: NDArray[np.float64], clearance: Vector, covariance: Points, neighbours: bool = False
+) -> Vector:
     """Return the one-sided 99 % bound of each margin of a barrier as a distance [m].
 
         clearance - 2.33 sum_k (g_k' C_k g_k)^(1/2) / |g|
@@ -108,16 +113,19 @@ def clearance_bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vecto
     and its neighbours counts: that of a point between two nodes is not greater.
 
     Args:
-        rows: of obstacles, wall or a barrier that a user added.
+        nodes: that each row depends on, shape (m, k).
+        gradient: g_k of each row, shape (m, k, 2).
+        clearance: of each row, shape (m,) [m].
         covariance: of each node, shape (n + 1, 2, 2) [m^2].
+        neighbours: whether the clearance is that of the half segments beside a node too.
     """
-    deviation, gradient = np.zeros(len(rows.clearance)), rows.gradient
-    for apart in (-1, 0, 1) if rows.name in SOLID else (0,):
-        near = covariance[np.clip(rows.nodes + apart, 0, len(covariance) - 1)]
+    deviation = np.zeros(len(clearance))
+    for apart in (-1, 0, 1) if neighbours else (0,):
+        near = covariance[np.clip(nodes.astype(np.int64) + apart, 0, len(covariance) - 1)]
         square = np.einsum("rka,rkab,rkb->rk", gradient, near, gradient)
         deviation = np.maximum(deviation, np.sqrt(np.maximum(square, 0.0)).sum(axis=1))
     slope = np.sqrt(np.einsum("rkd,rkd->r", gradient, gradient))
-    return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
+    return np.asarray(clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
 
 
 @dataclass
@@ -367,14 +375,23 @@ class ThreadEstimator:
         else:
             normal = normals_of(positions)
             covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
-        formulation.added.set_time(pose.stamp)
-        added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
+        # At once, as barriers may move on before they are asked again.
+        added = formulation.added.rows_at(pose.stamp, positions, pose.heading)
 
         def compute_margins() -> Margins:
-            rows = [*formulation.margins(positions, pose.heading), *added]
-            bounded = [each for each in rows if each.name in SOLID or each.name not in BUILT_IN]
-            bounds = {each.name: clearance_bound(each, covariance) for each in bounded}
-            return Margins.of(rows, tolerance, prediction.scene_version).with_bounds(bounds)
+            margins = formulation.margins(positions, pose.heading)
+            bounds = {
+                solid.barrier: clearance_bound(
+                    solid.node[:, None], solid.normal[:, None], solid.clearance, covariance, neighbours=True
+                )
+                for solid in margins
+                if solid.barrier in SOLID
+            }
+            bounds |= {
+                rows.name: clearance_bound(rows.nodes, rows.gradient, rows.clearance, covariance) for rows in added
+            }
+            margins += [BarrierMargins.from_rows(rows) for rows in added]
+            return Margins.of(margins, tolerance, prediction.scene_version).with_bounds(bounds)
 
         return ThreadEstimate(
             prediction=prediction,

@@ -42,6 +42,13 @@ class QuadraticProgram:
     upper: Vector
     unknown: NDArray[np.intp]
 
+    def check(self) -> None:
+        """Raise `ValueError` where a number is not finite or bounds cross."""
+        if not all(np.isfinite(values).all() for values in (self.P.data, self.q, self.A.data)):
+            raise ValueError("a number that is not finite")
+        if not (self.lower <= self.upper).all():
+            raise ValueError("a lower bound above the upper one")
+
 
 def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
     """Write a chain's program with sparse matrices, its known nodes taken out and its slacks as variables.
@@ -127,9 +134,10 @@ class OsqpSolver:
         general = as_quadratic_program(program)
         flat, found_multipliers = np.full(program.linear.size, np.nan), np.full(len(program.lower), np.nan)
         try:
+            general.check()  # OSQP prints what is wrong, and cannot be kept from it
             self._load(general)
             found = self._solver.solve(raise_error=False)
-        except self._osqp.OSQPException as error:
+        except (ValueError, self._osqp.OSQPException) as error:
             self._loaded, status, iterations = None, f"refused: {error}", 0
         else:
             status, iterations = str(found.info.status), int(found.info.iter)

@@ -128,9 +128,7 @@ def test_constraints_hold_after_a_correction() -> None:
         assert estimate.converged
         gap = np.linalg.norm(estimate.positions - np.array(disc.centre), axis=1) - disc.radius - 0.5 * thread.diameter
         assert gap.min() > -1.5e-7
-        lengths = np.linalg.norm(np.diff(estimate.positions, axis=0), axis=1)
-        rest = estimator.predictor.formulation.rest_lengths(estimate.positions, pose.heading)
-        assert np.abs(rest / lengths - 1.0).max() < 1.5e-3
+        assert np.abs(estimator.predictor.formulation.strain(estimate.positions, pose.heading)).max() < 1.5e-3
 
 
 def test_a_wrong_model_is_corrected() -> None:
@@ -152,19 +150,19 @@ def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
     estimator.start(way[0])
     estimate = estimator.step(way[1], whole(true_shapes(thread_of(), way)[1], 1))
     formulation = estimator.predictor.formulation
-    rows = {each.name: each for each in formulation.margins(estimate.positions, way[1].heading)}["obstacle"]
+    rows = {each.barrier: each for each in formulation.margins(estimate.positions, way[1].heading)}["obstacle"]
     bound = estimate.margins["obstacle"].bound
-    node, last = rows.nodes[:, -1], len(estimate.positions) - 1
+    node, last = rows.node.astype(int), len(estimate.positions) - 1
     beside = [np.clip(node + apart, 0, last) for apart in (-1, 0, 1)]  # the half segments' clearance is of these too
     deviations = [
-        np.sqrt(np.einsum("ra,rab,rb->r", rows.gradient[:, 0], estimate.covariance[at], rows.gradient[:, 0]))
-        for at in beside
+        np.sqrt(np.einsum("ra,rab,rb->r", rows.normal, estimate.covariance[at], rows.normal)) for at in beside
     ]
     expected = rows.clearance - 2.3263 * np.max(deviations, axis=0)
     np.testing.assert_allclose(bound, expected, rtol=1e-4)
     assert (bound < rows.clearance)[node > 0].all()
-    flat = replace(rows, gradient=np.zeros_like(rows.gradient))  # which no motion of a node changes
-    np.testing.assert_array_equal(clearance_bound(flat, estimate.covariance), rows.clearance)
+    flat = np.zeros_like(rows.normal)[:, None]  # which no motion of a node changes
+    bound = clearance_bound(node[:, None], flat, rows.clearance, estimate.covariance)
+    np.testing.assert_array_equal(bound, rows.clearance)
 
 
 def session_of(history: float = 1.0) -> EstimatorSession:

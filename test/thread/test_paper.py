@@ -85,8 +85,8 @@ def test_no_node_enters_an_obstacle_and_one_inside_is_pushed_out(obstacle: Disc 
 
     def least(positions: np.ndarray) -> float:
         rows = formulation.margins(positions, east())[-2]
-        assert rows.name == "obstacle"
-        return float(rows.value[rows.nodes[:, 0] > 0].min(initial=np.inf))
+        assert rows.barrier == "obstacle"
+        return float(rows.value[rows.node > 0].min(initial=np.inf))
 
     touched = False
     for done in followed(formulation, straight(thread), lambda k: k * 4e-5 * np.array([0.0, 1.0]), 300):
