@@ -67,7 +67,8 @@ def test_code_of_before_is_not_run_and_nothing_has_to_be_writable(tmp_path: Path
         return done.stdout.strip()
 
     places = {"NUMBA_CACHE_DIR": str(cache)}
-    assert [run("2.0", **places), run("2.0", **places), run("4.0", **places)] == ["42.0 True", "42.0 False", "84.0 True"]
+    results = [run("2.0", **places), run("2.0", **places), run("4.0", **places)]
+    assert results == ["42.0 True", "42.0 False", "84.0 True"]
     (tmp_path / "__pycache__").write_text("a file where a folder should be")
     nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), "/dev/null")
     nowhere["NUMBA_CACHE_DIR"] = "/dev/null/cache"

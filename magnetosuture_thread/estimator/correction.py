@@ -332,36 +332,49 @@ def correct(
     return contacts, off, largest
 
 
+class Correction(NamedTuple):
+    """A corrected thread.
+
+    Attributes:
+        problem: why the thread is not corrected; empty where the program was solved and the constraints hold.
+        residual: the largest of the last solve.
+        positions: of the nodes, shape (n + 1, 2) [D].
+        moved: by how much each node was, shape (n + 1, 2) [D].
+        covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
+        hidden: part of the thread that no point shows.
+    """
+
+    problem: str
+    residual: float
+    positions: Points
+    moved: Points
+    covariance: NDArray[np.float64]
+    hidden: float
+
+
 class Corrector:
     """Corrects a thread by measured points; see `correct`.
 
     Args:
         predictor: of the thread.
         formulation: its own.
-
-    Attributes:
-        work: the last correction; where it moved the thread is in it.
-        residual: the largest of its last solve.
     """
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
-        self._formulation, self.work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
-        self.work.known[[0, *predictor.fixed_nodes]] = True
-        self.residual = 0.0
+        self._formulation, self._work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
+        self._work.known[[0, *predictor.fixed_nodes]] = True
 
-    def solve(self, prior: Prior, points: MeasuredPoints) -> str:
-        """Solve the program about a predicted thread; the weights of the points are written.
-
-        Returns:
-            Why the thread is not corrected; empty where the program was solved and the constraints hold.
-        """
-        rod, workspace = self._formulation.rod, self._formulation.workspace.data
+    def solve(self, prior: Prior, points: MeasuredPoints) -> Correction:
+        """Solve the program about a predicted thread; the weights of the points are written."""
+        rod, workspace, work = self._formulation.rod, self._formulation.workspace.data, self._work
         scale = float(max((1.0 / prior.density[1:]).max(), (points.share / points.variance).max()))
-        prior_information(prior, scale, rod.clamped, self.work.program)
-        found = correct(rod, workspace, self.work, prior.positions, prior.heading, scale, points)
-        contacts, off, self.residual = found
+        prior_information(prior, scale, rod.clamped, work.program)
+        contacts, off, residual = correct(rod, workspace, work, prior.positions, prior.heading, scale, points)
+        problem, segments = "", len(prior.positions) - 1
         if contacts < 0:
-            return f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
-        if not self.residual <= RESIDUAL_TOLERANCE or off > 1.0:
-            return f"the correction was not solved: residual {self.residual:.1e}, off by {off:.1g}"
-        return ""
+            problem = f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
+        elif not residual <= RESIDUAL_TOLERANCE or off > 1.0:
+            problem = f"the correction was not solved: residual {residual:.1e}, off by {off:.1g}"
+        shown = np.unique(np.minimum(points.place.astype(np.int64), segments - 1))
+        arrays = work.about.copy(), work.moved.copy(), work.covariance.copy()
+        return Correction(problem, residual, *arrays, 1.0 - len(shown) / segments)

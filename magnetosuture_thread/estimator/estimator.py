@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator import association, noise
-from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
+from magnetosuture_thread.estimator.correction import Correction, Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
@@ -128,9 +128,9 @@ def clearance_bound(
     return np.asarray(clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class FilterState:
-    """What the next step and correction depend on, besides the predictor.
+    """What the next step and correction depend on, besides the predictor. It is replaced and never written to.
 
     Attributes:
         errors: variance and density of each node, see `noise`, shape (2, n + 1) [D^2].
@@ -228,11 +228,17 @@ class ThreadEstimator:
             InvalidInputError: see `ThreadPredictor.start`.
         """
         prediction = self.predictor.start(pose, centreline, strict=False)
+        seen, known = 0.0, 0.0
+        if centreline is not None:
+            seen, known = float(arc_lengths(centreline)[-1]), LAID_DEVIATION * association.MIN_DEVIATION
         self._forget()
-        now, seen = self._now, 0.0 if centreline is None else float(arc_lengths(centreline)[-1])
-        now.prediction, now.converged, now.unknown = prediction, prediction.converged, centreline is None
-        known = 0.0 if centreline is None else LAID_DEVIATION * association.MIN_DEVIATION
-        now.errors = self._errors_of(seen / self._unit, (known / self._unit) ** 2)
+        self._now = replace(
+            self._now,
+            prediction=prediction,
+            converged=prediction.converged,
+            unknown=centreline is None,
+            errors=self._errors_of(seen / self._unit, (known / self._unit) ** 2),
+        )
         return self._estimate([])
 
     def _errors_of(self, seen: float, variance: float) -> Points:
@@ -260,73 +266,95 @@ class ThreadEstimator:
             SolverError: see `ThreadPredictor.step`.
         """
         before, now = self.predictor.state, self._now
-        now.prediction = prediction = self.predictor.step(pose)
-        now.converged = prediction.converged
+        prediction, test = self.predictor.step(pose), copy(now.test)
         assert before is not None
         intensity = noise.at_nodes(now.noise.intensity, self.thread.segments + 1)
         intensity[0] = 0.0
         added = np.outer((1.0, 2.0 * self._length), intensity) * (prediction.interval / self._unit**2)
-        now.errors = noise.propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
-        now.test.decay(prediction.interval, self._formulation.nodes_in_contact)
+        errors = noise.propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
+        test.decay(prediction.interval, self._formulation.nodes_in_contact)
+        self._now = replace(now, prediction=prediction, converged=prediction.converged, errors=errors, test=test)
         return self.correct(observation) if observation is not None else self._estimate([])
 
     def correct(self, observation: ThreadObservation) -> ThreadEstimate:
-        """Correct the thread at the last pose by an observation of the same instant."""
-        now, state, pose, unit = self._now, self.predictor.state, self.predictor.pose, self._unit
+        """Correct the thread at the last pose by an observation of the same instant.
+
+        Its points are associated with the thread, the correction is solved, and the noise updated by what is left. The
+        result is kept in the end; where there is no solution, the thread stays where it was predicted.
+        """
+        state, pose = self.predictor.state, self.predictor.pose
         if state is None or pose is None:
             raise InvalidInputError("thread observation", "one before the start", "a centreline first")
+        now, state, points, problems = self._associate(observation, state, pose)
+        innovations, correction = None, None
+        if points is not None:
+            elapsed = pose.stamp - now.measured_at if math.isfinite(now.measured_at) else 0.0
+            learned = noise.learn(now.noise, points, now.errors, self._unit, elapsed, 2.0 * self._length)
+            now, innovations = replace(now, noise=learned[0], errors=learned[2]), learned[1]
+            prior = self._prior(now, state, pose)
+            correction = self._corrector.solve(prior, points)
+            if correction.problem:
+                problems, correction = [*problems, correction.problem], None
+            else:
+                now = self._updated(now, prior, points, correction, pose)
+                state = ThreadState(correction.positions * self._unit, state.velocities, state.interval)
+        self._now, self.predictor.state = now, state
+        return self._estimate(problems, innovations, 0 if points is None else len(points.place), correction)
+
+    def _associate(
+        self, observation: ThreadObservation, state: ThreadState, pose: NeedlePose
+    ) -> tuple[FilterState, ThreadState, association.MeasuredPoints | None, list[str]]:
+        """Return filter and thread before the correction, the points on the thread, and why others are refused."""
+        now, unit = self._now, self._unit
         placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
-        if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
-            state = laid
-            placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
-        points, refused = self._points_of(placed, state)
-        if points is None:
-            return self._estimate(problems + refused)
-        corrector, work = self._corrector, self._corrector.work
-        problems, count = problems + refused, len(points.place)
-        measured = math.isfinite(now.measured_at)
-        elapsed = pose.stamp - now.measured_at if measured else 0.0
-        now.noise, innovations, now.errors = noise.learn(
-            now.noise, points, now.errors, unit, elapsed, 2.0 * self._length
+        if placed:
+            now, laid = self._laid_along(placed[0], pose, state)
+            if laid is not state:
+                state = laid
+                placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
+        obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
+        points, refused = association.measured_points(
+            placed, state.positions / unit, float(now.errors[0, -1]), now.noise.scale, unit, obstacles
         )
-        prior = self._prior(state, pose)
-        if problem := corrector.solve(prior, points):
-            return self._estimate([*problems, problem], innovations, count)
-        normals = normals_of(prior.positions)
-        now.errors, applied, hidden = noise.take_correction(points, normals, work.moved, work.covariance, prior.density)
-        now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
-        if measured:  # else there is no earlier time to compare with
+        return now, state, points, problems + refused
+
+    def _updated(
+        self,
+        now: FilterState,
+        prior: Prior,
+        points: association.MeasuredPoints,
+        correction: Correction,
+        pose: NeedlePose,
+    ) -> FilterState:
+        """Return the filter after a correction."""
+        normals, moved, unit, test = normals_of(prior.positions), correction.moved, self._unit, now.test
+        errors, applied = noise.take_correction(points, normals, moved, correction.covariance, prior.density)
+        if math.isfinite(now.measured_at):  # else there is no earlier time to compare with
             # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
             # points of a window share it, and so do both times that the test compares.
             scale, sums = now.noise.scale, now.noise.sums
             variance = sums.own * (1.0 + 0.5 * max(1.0 - scale, MIN_SHARED) / scale * sums.independent) * unit**2
-            now.test.add(work.moved * unit, normals, variance, pose.stamp, np.asarray(pose.deviation))
-        self.predictor.pose = pose
-        self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
-        now.converged, now.unknown, now.measured_at = True, False, pose.stamp
-        return self._estimate(problems, innovations, count, hidden)
-
-    def _points_of(
-        self, placed: list[association.PlacedPiece], state: ThreadState
-    ) -> tuple[association.MeasuredPoints | None, list[str]]:
-        now, nodes = self._now, state.positions / self._unit
-        obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
-        return association.measured_points(
-            placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles
+            test = copy(test)
+            test.add(moved * unit, normals, variance, pose.stamp, np.asarray(pose.deviation))
+        learned = now.noise._replace(error=now.noise.error - unit * applied[:, None])
+        return replace(
+            now, errors=errors, noise=learned, test=test, converged=True, unknown=False, measured_at=pose.stamp
         )
 
-    def _prior(self, state: ThreadState, pose: NeedlePose) -> Prior:
+    def _prior(self, now: FilterState, state: ThreadState, pose: NeedlePose) -> Prior:
         unit, rod = self._unit, self._formulation.rod
         return Prior(
             np.ascontiguousarray(state.positions / unit),
             np.ascontiguousarray(pose.heading, dtype=np.float64),
-            np.maximum(self._now.errors[1], 1e-12),
-            noise.at_nodes(self._now.noise.raised, self.thread.segments + 1) / unit**2,
+            np.maximum(now.errors[1], 1e-12),
+            noise.at_nodes(now.noise.raised, self.thread.segments + 1) / unit**2,
             self._length,
             rod.bending_stiffness / (rod.drag_across * unit**4),
         )
 
-    def _laid_along(self, piece: association.PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
+    def _laid_along(
+        self, piece: association.PlacedPiece, pose: NeedlePose, state: ThreadState
+    ) -> tuple[FilterState, ThreadState]:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
 
         At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
@@ -335,43 +363,45 @@ class ThreadEstimator:
         now, unit, segments = self._now, self._unit, self.thread.segments
         # A piece that begins at the needle and lies more than 1.5 segments off gives the shape itself.
         if not piece.attached or (not now.unknown and piece.square < 1.5**2):
-            now.gross = 0
-            return None
-        now.gross += 1
-        end = piece.start + float(piece.arcs[-1])
+            return replace(now, gross=0), state
+        gross, end = now.gross + 1, piece.start + float(piece.arcs[-1])
         prior = float(np.interp(0.5 * end, np.arange(segments + 1), now.errors[0]))
         measured = math.isfinite(now.measured_at)
-        if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
-            return None
+        if not now.unknown and measured and gross < 2 and piece.square > 9.0 * prior:
+            return replace(now, gross=gross), state
         seen = smoothed_line(piece.points, piece.arcs, 2.0 * association.POINT_CORRELATION / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))
-        self.predictor.pose, self.predictor.state = pose, laid
         # Whether it lies outside of obstacles is not known before it is corrected.
-        now.gross, now.unknown, now.converged = 0, False, False
-        now.errors = self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance)))
-        now.noise, now.test = NoiseModel.new(), DisturbanceTest(self.thread)
-        return laid
+        now = replace(
+            now,
+            gross=0,
+            unknown=False,
+            converged=False,
+            errors=self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance))),
+            noise=NoiseModel.new(),
+            test=DisturbanceTest(self.thread),
+        )
+        return now, laid
 
     def _estimate(
         self,
         problems: Sequence[str],
         innovations: Innovations | None = None,
         points: int = 0,
-        hidden: float | None = None,
+        correction: Correction | None = None,
     ) -> ThreadEstimate:
-        """Return the estimate; `hidden` is None where the thread was not corrected."""
+        """Return the estimate; `correction` is None where the thread was not corrected."""
         now, pose, state, prediction = self._now, self.predictor.pose, self.predictor.state, self._now.prediction
         assert prediction is not None
         assert pose is not None
         assert state is not None
         formulation, positions, tolerance = self._formulation, state.positions, self.predictor.contact_tolerance
-        corrected = hidden is not None
         # Where innovations are larger than expected, so are the errors that are left.
         scale = self._unit**2 * max(now.noise.ratio, 1.0)
-        if corrected:
-            covariance = scale * self._corrector.work.covariance
+        if correction is not None:
+            covariance = scale * correction.covariance
         else:
             normal = normals_of(positions)
             covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
@@ -398,12 +428,12 @@ class ThreadEstimator:
             positions=positions,
             covariance=covariance,
             deviation=np.sqrt(scale * np.maximum(now.errors[0], 0.0)),
-            corrected=corrected,
+            corrected=correction is not None,
             unmeasured_for=pose.stamp - now.measured_at,
             converged=now.converged,
-            residual=self._corrector.residual if corrected else 0.0,
+            residual=0.0 if correction is None else correction.residual,
             points=points,
-            hidden=1.0 if hidden is None else hidden,
+            hidden=1.0 if correction is None else correction.hidden,
             innovations=innovations,
             noise=now.noise.intensity,
             disturbances=now.test.found(pose.stamp, positions),
@@ -413,13 +443,12 @@ class ThreadEstimator:
 
     def snapshot(self) -> Snapshot:
         """Return everything that the next step depends on."""
-        now, predictor = replace(self._now, test=copy(self._now.test)), self.predictor
-        return now, predictor.pose, predictor.state, self._formulation.warm_start()
+        predictor = self.predictor
+        return self._now, predictor.pose, predictor.state, self._formulation.warm_start()
 
     def restore(self, kept: Snapshot) -> None:
         """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
-        now, self.predictor.pose, self.predictor.state, warm_start = kept
-        self._now = replace(now, test=copy(now.test))
+        self._now, self.predictor.pose, self.predictor.state, warm_start = kept
         self._formulation.restore(warm_start)
 
     def follow_on(self, other: ThreadEstimator) -> None:

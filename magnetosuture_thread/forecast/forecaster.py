@@ -311,7 +311,7 @@ class NeedleDrag:
         if not 0.0 <= part < self.along:
             raise ConfigurationError("needle drag along", self.along, f"more than the thread's part, {part:g} N s/m")
         whole = thread.medium.drag_across * thread.length
-        return DragData(self.along, self.along - part, self.across, self.turning, whole)
+        return DragData(*map(float, (self.along, self.along - part, self.across, self.turning, whole)))
 
 
 class _ThreadWalk:
@@ -365,9 +365,6 @@ class _ThreadWalk:
         buffers = self._formulation.buffers
         loads, moved = (buffers.internal, buffers.tail_load), (self.positions, self._velocities, self._interval)
         self._formulation.write_forces(*moved, heading, loads, tension, pull)
-
-
-STEP_NEEDLE, FRICTION = TypedKernel(step_needle), TypedKernel(nodes_under_friction)
 
 
 class ThreadForecaster:
@@ -432,18 +429,20 @@ class ThreadForecaster:
         if law is not None and law.threshold > self.options.margin_range:
             expected = f"at least the friction threshold {law.threshold:g} m"
             raise ConfigurationError("margin_range", self.options.margin_range, expected)
-        self.thread, self.scene, self.safety, self.step = thread, scene, safety, step
+        self.thread, self.scene, self.safety, self.step = thread, scene, safety, float(step)
         self._formulation, self._law, self._averaging = formulation, law, float(friction_averaging)
         self._needle, self._drag = safety.compiled_data(), DragData() if drag is None else drag.data(thread)
         self._offset = tuple(float(part) for part in attachment_offset or (0.0, 0.0))
         self._nodes = np.array([0, *predictor.fixed_nodes], np.int64)
         reach = self.options.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
         self._around = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius).data
+        self._step_needle, self._friction_nodes = TypedKernel(step_needle), TypedKernel(nodes_under_friction)
         self._names = (*scene.names, WALL_NAME)
 
     def warm_up(self) -> None:
         """Load the compiled code, by a forecast of one step in the bare dish."""
-        bare = ThreadForecaster(self.thread, Scene(self.scene.dish), step=self.step)
+        scene, reach = Scene(self.scene.dish), self.options.margin_range
+        bare = ThreadForecaster(self.thread, scene, law=self._law, step=self.step, margin_range=reach)
         middle = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
         bare.forecast(bare.straight(middle), np.zeros(2), self.step)
 
@@ -485,7 +484,8 @@ class ThreadForecaster:
         margin, margin_nodes, margin_shapes = empty_margins(instants)
         added, known = np.zeros(3), start.needle_force is not None
         if start.needle_force is not None:
-            added[:], pull[0] = math.nan, start.needle_force  # what is no number is worked out from the force
+            pull[0] = start.needle_force
+            added[:] = math.nan if drag.along > 0.0 else 0.0  # what is no number is worked out from the force
         problem, done = "", 0
         for k in range(instants):
             vertices[k], poses[k] = walk.positions, pose
@@ -496,7 +496,7 @@ class ThreadForecaster:
             command = tuple(sequence[k].tolist()) if k < steps else (0.0, 0.0)
             pulled = drag if k > 0 or known else DragData()
             moved = command, float(slowdown[k]), interval, last, pull[k], added, touched[k]
-            least = STEP_NEEDLE(self._needle, pulled, pose, *moved)
+            least = self._step_needle(self._needle, pulled, pose, *moved)
             margin[k, NEEDLE_MARGIN], margin_shapes[k, NEEDLE_MARGIN] = least
             if k == steps:
                 break
@@ -540,7 +540,7 @@ class ThreadForecaster:
             if law is None:
                 return 1.0
             limit = law.threshold + 0.5 * self.thread.diameter
-            count = FRICTION(vertices, self._around, limit, contacts, close, rubbed)
+            count = self._friction_nodes(vertices, self._around, limit, contacts, close, rubbed)
             speeds = motion.update(vertices, interval)
             pulled = count > 0 and slowed and float(speeds[rubbed].max()) > law.stuck_speed
             return law.beta**count if pulled else 1.0

@@ -104,7 +104,7 @@ class Barrier(ABC):
         return type(self).set_time is not Barrier.set_time
 
     def move_to(self, stamp: float, first: float, needle: tuple[Points, Points] | None = None) -> None:
-        """Set the needle and both times: the stamp of the next evaluation, and by that of the first pose the time since."""
+        """Set the needle and both times, the next evaluation's stamp and what has passed since the first pose [s]."""
         self.ros_time, self.needle = stamp, needle
         self.set_time(stamp - first)
 

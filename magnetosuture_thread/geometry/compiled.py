@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -125,7 +126,8 @@ class TypedKernel:
     """A compiled function whose arguments have the same types in every call: these are determined in the first alone.
 
     numba determines the types of arguments in each call, and of named tuples in Python: 20 us for the sixty arrays of
-    a step's buffers, which is longer than the step of a thread takes. Arrays have to be contiguous each time.
+    a step's buffers, which is longer than the step of a thread takes. The types have to be the same each time: numbers
+    are floats or integers, arrays contiguous.
 
     Args:
         kernel: the compiled function.
@@ -141,3 +143,12 @@ class TypedKernel:
             self._kernel.compile(signature)
             self._code = self._kernel.overloads[signature].entry_point
         return self._code(*arguments)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make it again by the function's name, for `copy` and `pickle`."""
+        function = self._kernel.py_func
+        return _typed_kernel, (function.__module__, function.__name__)
+
+
+def _typed_kernel(module: str, name: str) -> TypedKernel:
+    return TypedKernel(getattr(import_module(module), name))

@@ -470,11 +470,6 @@ def accept_step(buffers: RodBuffers, friction: Vector, rows: int, interval: floa
             about[i, a] = start[i, a] + interval * velocities[i, a]
 
 
-SOLVE_STEP = {dimension: TypedKernel(solve_step) for dimension in (2, 3)}
-SEGMENT_ROWS = {dimension: TypedKernel(segment_rows_of) for dimension in (2, 3)}
-WRITE_FORCES = {dimension: TypedKernel(write_forces) for dimension in (2, 3)}
-
-
 class RodFormulation(Formulation):
     """Steps a thread by the program above; see `Formulation` for the arguments.
 
@@ -503,13 +498,13 @@ class RodFormulation(Formulation):
         medium = thread.medium
         self.rod = RodProperties(
             thread.attachment is Attachment.CLAMPED,
-            thread.segment_length,
-            self._radius,
-            thread.bending_stiffness,
-            medium.drag_across,
-            medium.drag_along,
-            medium.mass_per_length,
-            medium.bending_damping,
+            float(thread.segment_length),
+            float(self._radius),
+            float(thread.bending_stiffness),
+            float(medium.drag_across),
+            float(medium.drag_along),
+            float(medium.mass_per_length),
+            float(medium.bending_damping),
             self._vector("gravity", medium.gravity),
             np.ascontiguousarray(thread.rest_angles),
             mechanics.end_corrected_weights(thread.segments),
@@ -520,6 +515,8 @@ class RodFormulation(Formulation):
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
         self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._program.first))
+        self._solve_step, self._force_kernel = TypedKernel(solve_step), TypedKernel(write_forces)
+        self._segment_kernel = TypedKernel(segment_rows_of)
         self._last_nodes = np.arange(1, self._rows + 1, dtype=np.uint32)
         self._last_nodes.flags.writeable = False
         selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
@@ -549,7 +546,7 @@ class RodFormulation(Formulation):
         """Return a vector of the medium, zeros where it has none."""
         if len(values) not in (0, self.dimension):
             raise ConfigurationError(f"medium.{name}", values, f"{self.dimension} values, or none")
-        return np.array(values) if values else np.zeros(self.dimension)
+        return np.array(values, np.float64) if values else np.zeros(self.dimension)
 
     def check_start(self, positions: Points) -> None:
         """Refuse a thread that crosses itself where it cannot; see `Formulation`."""
@@ -628,7 +625,7 @@ class RodFormulation(Formulation):
         """Let compiled code take a step as far as it gets; see `solve_step`. Arrays have to be contiguous."""
         model = self.step_model if model is None else model
         arguments = model, self.buffers, self._solver_buffers, step_input, solves, elsewhere
-        return StepProgress(*SOLVE_STEP[self.dimension](*arguments))
+        return StepProgress(*self._solve_step(*arguments))
 
     def separate(self) -> RodFormulation:
         """Return the same formulation with buffers of its own, for the steps of another thread like this one."""
@@ -682,7 +679,7 @@ class RodFormulation(Formulation):
         rod = self.rod
         scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
         arguments = rod, positions / rod.unit, velocities, heading, *loads, scale, tension, force
-        return WRITE_FORCES[self.dimension](*arguments), scale
+        return self._force_kernel(*arguments), scale
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
@@ -701,7 +698,7 @@ class RodFormulation(Formulation):
     def _segment_rows(self, positions: Points, heading: Points) -> Table:
         """Return value and clearance of connectivity and of compression, and the chords; see `segment_rows_of`."""
         points, rows = np.ascontiguousarray(positions), np.empty((5, self._rows))
-        SEGMENT_ROWS[self.dimension](self.rod, points, np.ascontiguousarray(heading), np.empty(points.shape), rows)
+        self._segment_kernel(self.rod, points, np.ascontiguousarray(heading), np.empty(points.shape), rows)
         return rows
 
     def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:

@@ -261,9 +261,6 @@ class AddedBarriers:
         )
 
 
-SOLID_ROWS = {dimension: TypedKernel(solid_rows) for dimension in (2, 3)}
-
-
 class Formulation(ABC):
     """A way of writing one step of the thread as a quadratic program.
 
@@ -305,6 +302,7 @@ class Formulation(ABC):
         self.workspace = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)
         self._contacts = Contacts.room(MARGINS_PER_NODE * nodes, self.dimension)  # memory of margins
+        self._solid_rows = TypedKernel(solid_rows)
         self._rows, self._program = rows, StepBuffers.of(nodes, self.dimension, rows)
 
     @abstractmethod
@@ -379,7 +377,7 @@ class Formulation(ABC):
         while count < 0:
             rows = SolidRows.room(len(self._contacts.node), self.dimension)
             known = points, self._margin_workspace.data, self._radius, self._contacts
-            count, obstacles = SOLID_ROWS[self.dimension](*known, rows)
+            count, obstacles = self._solid_rows(*known, rows)
             if count < 0:  # in a scene of many shapes a node may be near all of them
                 self._contacts = Contacts.room(4 * len(self._contacts.node), self.dimension)
         columns = [column[:count].copy() for column in rows]
