@@ -34,11 +34,11 @@ from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_checks import WALL_NAME
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.thread.margins import FrictionLaw, NodeMotion
+from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import PredictorOptions, ThreadPredictor
-from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, Table
+from magnetosuture_thread.thread.program import ABOUT, CONTACTS_PER_NODE, Table
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation, StepInput
 from magnetosuture_thread.thread.step import WarmStart
 
@@ -330,7 +330,7 @@ class _ThreadWalk:
             self._formulation.restore(start.warm_start)
         still = np.zeros_like(start.vertices) if start.velocities is None else start.velocities
         self.positions, self._velocities = np.array([start.vertices, still], np.float64)
-        self._interval, self.converged = float(start.interval), True
+        self._ends, self._interval, self.converged = self.positions[nodes], float(start.interval), True
 
     def step(self, tail: Vector, before: Vector, heading: Vector, interval: float) -> str:
         """Follow the point where the thread is fixed, in as many steps as `ThreadPredictor`; return what fails.
@@ -341,15 +341,17 @@ class _ThreadWalk:
             heading: and after it.
             interval: duration [s].
         """
-        begin, formulation = self.positions[self._nodes], self._formulation
-        end = begin.copy()
+        begin, end, formulation = self.positions[0].copy(), self._ends.copy(), self._formulation
         end[0] = tail
-        count = self._options.substeps(interval, math.dist(begin[0].tolist(), tail.tolist()) / formulation.rod.unit)
+        count = self._options.substeps(interval, math.dist(begin.tolist(), tail.tolist()) / formulation.rod.unit)
+        ends, mixed = end, heading
         for index in range(1, count + 1):
-            part = index / count
-            mixed = (1.0 - part) * before + part * heading
-            size = math.hypot(*mixed.tolist())
-            mixed, ends = mixed / size if size > 1e-6 else heading, begin + part * (end - begin)
+            if count > 1:
+                part, ends = index / count, end.copy()
+                ends[0] = begin + part * (tail - begin)
+                mixed = (1.0 - part) * before + part * heading
+                size = math.hypot(*mixed.tolist())
+                mixed = mixed / size if size > 1e-6 else heading
             moved = self._nodes, ends, mixed, interval / count, self._interval
             progress = formulation.solve(StepInput(self.positions, self._velocities, *moved))
             if progress.code != ENDED:
@@ -363,7 +365,8 @@ class _ThreadWalk:
     def write_forces(self, heading: Vector, tension: Vector, pull: Vector) -> None:
         """Write the tension of each segment and the thread's pull upon the needle [N]."""
         buffers = self._formulation.buffers
-        loads, moved = (buffers.internal, buffers.tail_load), (self.positions, self._velocities, self._interval)
+        loads = buffers.internal, buffers.tail_load
+        moved = buffers.motion[ABOUT], self._velocities, self._interval
         self._formulation.write_forces(*moved, heading, loads, tension, pull)
 
 
@@ -473,7 +476,7 @@ class ThreadForecaster:
         self._check_start(start)
         sequence = np.zeros((steps, 2)) if callable(commands) else self._sequence(commands, steps)
         nodes, instants, drag = self.thread.segments + 1, steps + 1, self._drag
-        walk, friction = _ThreadWalk(self._formulation, start, self._nodes, self.options), self._friction(slowed)
+        walk, friction = _ThreadWalk(self._formulation, start, self._nodes, self.options), self._friction(start, slowed)
         heading = np.asarray(start.pose.heading, np.float64)
         pose = np.concatenate([np.asarray(start.pose.tail, np.float64), heading / np.linalg.norm(heading)])
         last = np.array([math.nan, math.nan] if start.tip_velocity is None else start.tip_velocity, np.float64)
@@ -493,7 +496,7 @@ class ThreadForecaster:
             if k < steps and callable(commands):
                 velocity = commands(k * interval, pose[:2].copy(), pose[2:].copy())
                 sequence[k] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
-            command = tuple(sequence[k].tolist()) if k < steps else (0.0, 0.0)
+            command = tuple(sequence[k].tolist() if k < steps else (0.0, 0.0))
             pulled = drag if k > 0 or known else DragData()
             moved = command, float(slowdown[k]), interval, last, pull[k], added, touched[k]
             least = self._step_needle(self._needle, pulled, pose, *moved)
@@ -531,20 +534,21 @@ class ThreadForecaster:
             touched=touched[:done],
         )
 
-    def _friction(self, slowed: bool) -> Callable[[Points, float, NDArray[np.bool_]], float]:
+    def _friction(self, start: ForecastStart, slowed: bool) -> Callable[[Points, float, NDArray[np.bool_]], float]:
         """Return the friction law over one forecast: it writes the nodes under friction, and returns the slowdown."""
-        law, motion, close = self._law, NodeMotion(self._averaging), np.zeros(self.thread.segments + 1, np.int64)
-        contacts = self._contacts()
+        law, nodes, averaging = self._law, self.thread.segments + 1, self._averaging
+        contacts, close, (last, velocities) = self._contacts(), np.zeros(nodes, np.int64), np.zeros((2, nodes, 2))
+        share = 1.0 - math.exp(-self.step / averaging) if averaging > 0.0 else 1.0
 
         def slowdown(vertices: Points, interval: float, rubbed: NDArray[np.bool_]) -> float:
             if law is None:
                 return 1.0
             limit = law.threshold + 0.5 * self.thread.diameter
-            count = self._friction_nodes(vertices, self._around, limit, contacts, close, rubbed)
-            speeds = motion.update(vertices, interval)
-            pulled = count > 0 and slowed and float(speeds[rubbed].max()) > law.stuck_speed
-            return law.beta**count if pulled else 1.0
+            motion = vertices, last, velocities, share, interval
+            count, fastest = self._friction_nodes(*motion, self._around, limit, contacts, close, rubbed)
+            return law.beta**count if count and slowed and fastest > law.stuck_speed else 1.0
 
+        last[:] = start.vertices
         return slowdown
 
     def _write_margins(self, vertices: Table, headings: Points, *margins: NDArray[Any]) -> None:
@@ -575,6 +579,8 @@ class ThreadForecaster:
 
     def _attached(self, tail: Vector, heading: Vector) -> Vector:
         """Return where the thread is fixed, shape (2,) [m]."""
+        if not any(self._offset):
+            return tail
         (x, y), (along, left) = heading, self._offset
         return np.asarray(tail + np.array([along * x - left * y, along * y + left * x]))
 

@@ -120,27 +120,47 @@ def step_needle(
 
 @compiled_uncounted
 def nodes_under_friction(
-    positions: Points, around: WorkspaceData, limit: float, contacts: Contacts, close: Indices, rubbed: Mask
-) -> int:
-    """Write which nodes are closer than a limit to two shapes or more, the needle's aside; return how many are.
+    positions: Points,
+    last: Points,
+    velocities: Points,
+    share: float,
+    interval: float,
+    around: WorkspaceData,
+    limit: float,
+    contacts: Contacts,
+    close: Indices,
+    rubbed: Mask,
+) -> tuple[int, float]:
+    """Write which nodes are closer than a limit to two shapes or more, the needle's aside; see `FrictionLaw`.
 
     Args:
         positions: nodes, shape (n + 1, 2) [m].
+        last: where they were; written, as positions are.
+        velocities: averaged over time, see `NodeMotion`; written, shape (n + 1, 2) [m/s].
+        share: of the new velocity in the average.
+        interval: since `last` [s].
         around: shapes, with a reach of at least the limit.
         limit: distance of a node from a shape [m].
         contacts: memory.
         close: memory, shape (n + 1,).
         rubbed: written, shape (n + 1,).
+
+    Returns:
+        How many nodes they are, and the greatest speed of them [m/s].
     """
     close[:] = 0
     for c in range(find_contacts(positions, around, contacts)):
         if contacts.obstacle[c] != WALL and contacts.nearest[c] and contacts.distance[c] < limit:
             close[contacts.node[c]] += 1
-    count = 0
+    count, fastest = 0, 0.0
     for i in range(len(close)):
+        for a in range(2):
+            velocities[i, a] += share * ((positions[i, a] - last[i, a]) / interval - velocities[i, a])
+            last[i, a] = positions[i, a]
         rubbed[i] = i > 0 and close[i] >= 2
-        count += rubbed[i]
-    return count
+        if rubbed[i]:
+            count, fastest = count + 1, max(fastest, math.hypot(velocities[i, 0], velocities[i, 1]))
+    return count, fastest
 
 
 @compiled_uncounted

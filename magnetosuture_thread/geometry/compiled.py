@@ -134,12 +134,13 @@ class TypedKernel:
     """
 
     def __init__(self, kernel: Callable[..., Any]) -> None:
-        self._kernel, self._code = cast(Any, kernel), None
+        self._kernel: Any = kernel
+        self._code: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
         if self._code is None:
-            signature = tuple(numba.typeof(argument) for argument in arguments)
+            signature = tuple(cast(Any, numba).typeof(argument) for argument in arguments)
             self._kernel.compile(signature)
             self._code = self._kernel.overloads[signature].entry_point
         return self._code(*arguments)

@@ -206,9 +206,9 @@ class Margins(Mapping[str, BarrierMargins]):
 
 def _row(margins: BarrierMargins, row: int) -> BarrierMargins:
     part = slice(row, row + 1)
-    columns = (margins.node, margins.obstacle, margins.value, margins.clearance)
+    value, clearance = margins.value[part], margins.clearance[part]
     least = np.array([margins.bound.min(initial=math.inf)])
-    return BarrierMargins(margins.barrier, *(column[part] for column in columns), least)
+    return BarrierMargins(margins.barrier, margins.node[part], margins.obstacle[part], value, clearance, least)
 
 
 def node_clearance(margins: Margins, count: int) -> NDArray[np.float64]:

@@ -55,8 +55,9 @@ class NeedlePose:
 
     def __post_init__(self) -> None:
         """Take sequences of numbers as arrays, and numbers of other types as floats."""
-        if isinstance(self.stamp, np.number):
-            object.__setattr__(self, "stamp", float(self.stamp))
+        stamp: Any = self.stamp
+        if isinstance(stamp, np.number):
+            object.__setattr__(self, "stamp", float(stamp))
         for name in ("tail", "heading"):
             object.__setattr__(self, name, as_numbers(f"needle pose {name}", getattr(self, name)))
 

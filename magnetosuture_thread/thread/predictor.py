@@ -84,6 +84,8 @@ class PredictorOptions:
 
     def substeps(self, interval: float, way: float) -> int:
         """Return into how many steps an interval [s] is divided in which the fastest node goes a way [segments]."""
+        if interval <= self.max_step and way <= MAX_STEP_LENGTH:
+            return 1
         wanted = max(interval / self.max_step, way / MAX_STEP_LENGTH, 1.0)
         return min(self.max_substeps, math.ceil(wanted - 1e-9))
 

@@ -644,7 +644,7 @@ class RodFormulation(Formulation):
         assert result.loads is not None
         state, (internal, contact, load) = result.state, result.loads
         tension, force = np.empty(self._rows), np.empty(self.dimension)
-        moved = state.positions, state.velocities, state.interval
+        moved = state.positions / self.rod.unit, state.velocities, state.interval
         moment, scale = self.write_forces(*moved, heading, (internal, load), tension, force)
         friction, use = np.zeros((2, self._rows + 1))
         if result.grip is not None:
@@ -665,7 +665,7 @@ class RodFormulation(Formulation):
         """Write tension and force at the end of a step; see `write_forces`. Arrays have to be contiguous.
 
         Args:
-            positions: of all nodes, shape (n + 1, d) [m].
+            positions: of all nodes, shape (n + 1, d) [D].
             velocities: over the step [m/s].
             interval: of the step [s].
             heading: of the needle, shape (d,).
@@ -678,7 +678,8 @@ class RodFormulation(Formulation):
         """
         rod = self.rod
         scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
-        arguments = rod, positions / rod.unit, velocities, heading, *loads, scale, tension, force
+        along = np.ascontiguousarray(heading)
+        arguments = rod, positions, velocities, along, *loads, scale, tension, force
         return self._force_kernel(*arguments), scale
 
     def warm_up(self) -> None:

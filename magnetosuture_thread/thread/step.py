@@ -380,10 +380,10 @@ class Formulation(ABC):
             count, obstacles = self._solid_rows(*known, rows)
             if count < 0:  # in a scene of many shapes a node may be near all of them
                 self._contacts = Contacts.room(4 * len(self._contacts.node), self.dimension)
-        columns = [column[:count].copy() for column in rows]
+        node, obstacle, value, clearance, normal = (column[:count].copy() for column in rows)
         return [
-            BarrierMargins(OBSTACLE, *(column[:obstacles] for column in columns[:4]), normal=columns[4][:obstacles]),
-            BarrierMargins(WALL, *(column[obstacles:] for column in columns[:4]), normal=columns[4][obstacles:]),
+            BarrierMargins(name, node[part], obstacle[part], value[part], clearance[part], normal=normal[part])
+            for name, part in ((OBSTACLE, slice(obstacles)), (WALL, slice(obstacles, None)))
         ]
 
     def _solve(self, program: ChainProgram, velocities: Points, added: AddedRows | None) -> Solution:
