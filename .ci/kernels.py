@@ -1,13 +1,12 @@
 """Compiles the kernels that each process of the tests would compile by itself, or hands compiled ones on.
 
-With a folder, that of the package as it is installed elsewhere, the kernels of this tree are copied there: numba takes
-them for a file of the same content and time of change. Else they are compiled.
+With a folder, that of the package as it is installed elsewhere, the kernels of this tree are copied there: they are
+those of files of the same content. Else they are compiled.
 """
 
 from __future__ import annotations
 
 import filecmp
-import os
 import shutil
 import subprocess
 import sys
@@ -21,7 +20,6 @@ ROOT = Path(__file__).resolve().parent.parent
 IN_SPACE = ("test/test_examples.py::test_an_example_runs[ball_in_space]",)
 # ... and of the other formulations, of needle and rod, and of forecasts in batches, which share most.
 BESIDES = (
-    "test/calibration/test_online_agreement.py",
     "test/calibration/test_search.py::test_the_paper_s_numbers_are_fitted_too",
     "test/thread/test_self_contact.py::test_the_rows_are_the_distances_of_nodes_from_segments",
     "test/rig/mechanics/test_rod.py::test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives",
@@ -48,9 +46,7 @@ def copy_kernels(package: Path) -> None:
         installed = package / source.relative_to(PACKAGE)
         if not installed.exists() or not filecmp.cmp(source, installed, shallow=False):
             sys.exit(f"{installed}: expected a copy of {source}")
-        status = source.stat()
-        os.utime(installed, ns=(status.st_atime_ns, status.st_mtime_ns))
-    for kernel in [*PACKAGE.rglob("__pycache__/*.nb[ci]"), PACKAGE / "__pycache__" / "kernels.json"]:
+    for kernel in PACKAGE.rglob("__pycache__/*.nb[ci]"):
         copy = package / kernel.relative_to(PACKAGE)
         copy.parent.mkdir(exist_ok=True)
         shutil.copy2(kernel, copy)

@@ -21,6 +21,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 
 SEGMENT = 1.85e-3  # m; of the paper's thread
+MAX_LENGTH = 2.0  # m; of a thread: longer chains have shorter segments
 SPEED = 10e-3  # m/s
 RATE = 66.0  # poses a second
 TRIANGLES = 200  # of each obstacle
@@ -64,18 +65,18 @@ def case(segments: int, dimension: int, obstacles: bool, steps: int) -> Case:
     """Return a motion: the needle goes along the track, 0.15 mm a step.
 
     Args:
-        segments: n; the thread is n * 1.85 mm long.
+        segments: n; the thread is n * 1.85 mm long, and at most `MAX_LENGTH`.
         dimension: d, 2 or 3.
         obstacles: whether there are three obstacles of 200 triangles, or none.
         steps: k.
     """
-    travel = SPEED / RATE
+    travel, segment = SPEED / RATE, min(SEGMENT, MAX_LENGTH / segments)
     arc = np.arange(1.0, steps + 1.0) * travel
-    behind = -SEGMENT * np.arange(segments + 1.0)
+    behind = -segment * np.arange(segments + 1.0)
     positions = _track(np.concatenate([behind, arc]), dimension)
     return Case(
         thread=Thread.of(
-            MATERIALS["silk_6_0"], length=segments * SEGMENT, segments=segments, attachment=Attachment.PINNED
+            MATERIALS["silk_6_0"], length=segments * segment, segments=segments, attachment=Attachment.PINNED
         ),
         shapes=_obstacles(dimension) if obstacles else (),
         start=positions[: segments + 1].copy(),

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from magnetosuture_thread.geometry.compiled import compiled, delete_stale_cache
+from magnetosuture_thread.geometry.compiled import compiled, source_digest
 
 
 def test_a_compiled_function_is_the_same_function():
@@ -20,32 +20,59 @@ def test_a_compiled_function_is_the_same_function():
     assert half.__doc__ == "Return half."
 
 
-def test_kernels_are_deleted_when_a_file_that_they_depend_on_changes(tmp_path: Path):
+def test_the_digest_of_kernels_is_of_every_file_that_they_depend_on(tmp_path: Path):
     """Numba itself looks only at the file of the function that is called."""
-    cache = tmp_path / "room" / "__pycache__"
-    cache.mkdir(parents=True)
-    (tmp_path / "room/caller.py").write_text(
-        "from magnetosuture_thread.geometry.compiled import compiled\nfrom magnetosuture_thread.callee import f\n"
-    )
-    (tmp_path / "callee.py").write_text("from magnetosuture_thread.constants import X\n")
-    (tmp_path / "constants.py").write_text("X = 1\n")
-    (tmp_path / "other.py").write_text("from magnetosuture_thread.geometry.compiled import compiled\n")
-    kernels = [cache / "caller.f-1.py311.nbi", cache / "caller.f-1.py311.1.nbc"]
+    texts = {
+        "room/caller.py": """
+from magnetosuture_thread.callee import f
+from magnetosuture_thread.room import (
+    inner,
+)
+""",
+        "room/inner.py": "",
+        "callee.py": "from magnetosuture_thread.constants import X\n",
+        "constants.py": "X = 1\n",
+        "other.py": "",
+    }
+    for number, changed in enumerate(["", *texts]):
+        package = tmp_path / str(number)
+        for name, text in texts.items():
+            (package / name).parent.mkdir(exist_ok=True, parents=True)
+            (package / name).write_text(text + "# changed\n" * (name == changed))
+    digests = [source_digest(tmp_path / str(n) / "room/caller.py", tmp_path / str(n)) for n in range(len(texts) + 1)]
+    assert [digest != digests[0] for digest in digests[1:]] == [True, True, True, True, False]
 
-    def is_kept(*, changed: str = "") -> bool:
-        if changed:
-            os.utime(tmp_path / changed, (1.0, 1.0))
-        for kernel in kernels:
-            kernel.write_text("code")
-        delete_stale_cache(tmp_path)
-        return all(kernel.exists() for kernel in kernels)
 
-    assert not is_kept()  # of an unknown state
-    assert is_kept()
-    assert is_kept(changed="other.py")
-    for name in ("callee.py", "constants.py", "room/caller.py"):
-        assert not is_kept(changed=name), name
-        assert is_kept()
+KERNEL = """
+from magnetosuture_thread.geometry.compiled import compilations, compiled
+
+@compiled
+def double(x: float) -> float:
+    return {factor} * x
+
+print(double(21.0), compilations() > 0)
+"""
+
+
+def test_code_of_before_is_not_run_and_nothing_has_to_be_writable(tmp_path: Path):
+    """In the user's cache, as beside the file; and with no place for a cache at all."""
+    script, cache = tmp_path / "kernel.py", tmp_path / "cache"
+
+    def run(factor: str, **places: str) -> str:
+        script.write_text(KERNEL.format(factor=factor))
+        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **places}
+        done = subprocess.run(
+            [sys.executable, script], env=environment, check=True, timeout=600, stdout=subprocess.PIPE, text=True
+        )
+        return done.stdout.strip()
+
+    places = {"NUMBA_CACHE_DIR": str(cache)}
+    results = [run("2.0", **places), run("2.0", **places), run("4.0", **places)]
+    assert results == ["42.0 True", "42.0 False", "84.0 True"]
+    (tmp_path / "__pycache__").write_text("a file where a folder should be")
+    nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), "/dev/null")
+    nowhere["NUMBA_CACHE_DIR"] = "/dev/null/cache"
+    assert [run("2.0", **nowhere), run("2.0", **nowhere)] == ["42.0 True", "42.0 True"]
 
 
 def test_a_second_start_compiles_nothing():
@@ -72,9 +99,3 @@ print(len(compilations.buffer))
     assert compilations(new_kernel) > 0
     compilations("ThreadModelSettings().predictor(None)")
     assert compilations("ThreadModelSettings().predictor(None)") == 0
-
-
-def test_a_package_that_cannot_be_written_is_left_alone(tmp_path: Path):
-    (tmp_path / "kernel.py").write_text("from magnetosuture_thread.geometry.compiled import compiled\n")
-    (tmp_path / "__pycache__").write_text("a file where a folder should be, as nothing can be written into it")
-    assert delete_stale_cache(tmp_path)

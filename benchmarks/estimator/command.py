@@ -22,7 +22,7 @@ from rich.table import Table
 from benchmarks.estimator.truth import LENGTH, RATE, WALL_RADIUS, CameraModel, Run, simulate
 from magnetosuture_thread.bags.reading import pose_deviation
 from magnetosuture_thread.commands.command import make_log, progress
-from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
@@ -56,7 +56,6 @@ class Case:
         latency: of the camera, in frames.
         start: `measured`, `straight`, or `bent`: wrong by a fifth of the length.
         second: whether another thread lies in the dish.
-        learned: slow parameters that the estimator is asked to learn.
         better: whether the estimate must be better than the prediction alone, too.
     """
 
@@ -70,7 +69,6 @@ class Case:
     latency: int = 0
     start: str = "measured"
     second: bool = False
-    learned: tuple[str, ...] = ()
     better: bool = False
 
 
@@ -78,7 +76,7 @@ def _hidden(first: float, last: float) -> CameraModel:
     return CameraModel(hidden=(first * LENGTH, last * LENGTH))
 
 
-STIFFER, SOFTER, LEARNED = {"stiffness": 5.0}, {"stiffness": 0.2}, ("stiffness_over_drag",)
+STIFFER, SOFTER = {"stiffness": 5.0}, {"stiffness": 0.2}
 CASES = {
     case.name: case
     for case in (
@@ -98,8 +96,6 @@ CASES = {
         Case("middle, stiffness x 5", (2.0, 6.0), STIFFER, _hidden(0.25, 0.75)),
         Case("last half, stiffness x 5", (2.0, 6.0), STIFFER, _hidden(0.5, 1.0)),
         Case("last half, stiffness / 5", (2.0, 6.0), SOFTER, _hidden(0.5, 1.0)),
-        Case("last half, x 5, learned", (2.0, 6.0), STIFFER, _hidden(0.5, 1.0), learned=LEARNED),
-        Case("last half, / 5, learned", (2.0, 6.0), SOFTER, _hidden(0.5, 1.0), learned=LEARNED),
         Case("5 frames a second", every=6),
         Case("30 % lost", lost=0.3),
         Case("latency 0.2 s", latency=6),
@@ -154,8 +150,7 @@ def contact_frame(run: Run) -> int:
 def estimator_of(run: Run, case: Case, segments: int = 25) -> ThreadEstimator:
     """Return an estimator that knows of a run what the case lets it."""
     workspace = Workspace(() if case.post == "unknown" else run.posts, 5e-3, wall_radius=run.wall_radius)
-    options = EstimatorOptions(slow_parameters=case.learned) if case.learned else None
-    estimator = ThreadEstimator(ThreadPredictor(replace(run.thread, segments=segments), workspace), options)
+    estimator = ThreadEstimator(ThreadPredictor(replace(run.thread, segments=segments), workspace))
     estimator.warm_up()
     return estimator
 

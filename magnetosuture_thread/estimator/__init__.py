@@ -5,6 +5,5 @@ from __future__ import annotations
 from magnetosuture_thread.estimator.disturbance import Disturbance
 from magnetosuture_thread.estimator.estimator import EstimatorOptions, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.estimator.session import EstimatorSession
-from magnetosuture_thread.estimator.stiffness import SlowParameter
 
-__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "SlowParameter", "ThreadEstimate", "ThreadEstimator"]
+__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"]

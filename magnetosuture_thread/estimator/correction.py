@@ -39,7 +39,6 @@ from magnetosuture_thread.thread.solvers import BandedSolver
 
 Vector = NDArray[np.float64]
 
-AXES = (0, 1)
 MAX_SOLVES = 8  # of a correction
 RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
@@ -333,22 +332,24 @@ def correct(
     return contacts, off, largest
 
 
-class Sensitivity(NamedTuple):
-    """What a correction makes of the derivative of the nodes by a parameter, and what its residuals say of that.
+class Correction(NamedTuple):
+    """A corrected thread.
 
     Attributes:
-        corrected: V, shape (n + 1, 2) [D].
-        information: J.
-        score: s.
-        square: squared innovations over their covariance, nu' S^-1 nu.
-        independent: number of independent points.
+        problem: why the thread is not corrected; empty where the program was solved and the constraints hold.
+        residual: the largest of the last solve.
+        positions: of the nodes, shape (n + 1, 2) [D].
+        moved: by how much each node was, shape (n + 1, 2) [D].
+        covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
+        hidden: part of the thread that no point shows.
     """
 
-    corrected: Points
-    information: float
-    score: float
-    square: float
-    independent: float
+    problem: str
+    residual: float
+    positions: Points
+    moved: Points
+    covariance: NDArray[np.float64]
+    hidden: float
 
 
 class Corrector:
@@ -357,86 +358,23 @@ class Corrector:
     Args:
         predictor: of the thread.
         formulation: its own.
-
-    Attributes:
-        work: the last correction; where it moved the thread is in it.
-        residual: the largest of its last solve.
     """
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
-        self._formulation, self.work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
-        self.work.known[[0, *predictor.fixed_nodes]] = True
-        self.residual = 0.0
-        self._last: tuple[Prior, MeasuredPoints, float]
+        self._formulation, self._work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
+        self._work.known[[0, *predictor.fixed_nodes]] = True
 
-    def solve(self, prior: Prior, points: MeasuredPoints) -> str:
-        """Solve the program about a predicted thread; the weights of the points are written.
-
-        Returns:
-            Why the thread is not corrected; empty where the program was solved and the constraints hold.
-        """
-        rod, workspace = self._formulation.rod, self._formulation.workspace.data
+    def solve(self, prior: Prior, points: MeasuredPoints) -> Correction:
+        """Solve the program about a predicted thread; the weights of the points are written."""
+        rod, workspace, work = self._formulation.rod, self._formulation.workspace.data, self._work
         scale = float(max((1.0 / prior.density[1:]).max(), (points.share / points.variance).max()))
-        prior_information(prior, scale, rod.clamped, self.work.program)
-        found = correct(rod, workspace, self.work, prior.positions, prior.heading, scale, points)
-        contacts, off, self.residual = found
-        self._last = (prior, points, scale)
+        prior_information(prior, scale, rod.clamped, work.program)
+        contacts, off, residual = correct(rod, workspace, work, prior.positions, prior.heading, scale, points)
+        problem, segments = "", len(prior.positions) - 1
         if contacts < 0:
-            return f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
-        if not self.residual <= RESIDUAL_TOLERANCE or off > 1.0:
-            return f"the correction was not solved: residual {self.residual:.1e}, off by {off:.1g}"
-        return ""
-
-    def sensitivity(self, derivative: Points) -> Sensitivity:
-        """Return what the last correction makes of a derivative of the predicted nodes by a parameter.
-
-        With U that derivative, M = Lambda + A' W A the matrix of the program with its constraints, d the correction and
-        nu - A d what it leaves of the innovations,
-
-            V = U - M^-1 A' W A U           derivative of the corrected nodes
-            J = (A' W A U)' V               information of the frame on the parameter, U' A' S^-1 A U
-            s = (A U)' W (nu - A d)         its score, U' A' S^-1 nu
-
-        with S = A Lambda^-1 A' + W^-1 the covariance of the innovations, which is never written: the factor of the
-        banded matrix, which the correction leaves, serves.
-
-        Source: B. Friedland, Treatment of bias in recursive filtering, 1969; matrix inversion lemma. Deviation: the
-        nodes are constrained, and M holds the constraints that were active.
-
-        Args:
-            derivative: U, shape (n + 1, 2) [D].
-        """
-        prior, points, scale = self._last
-        along = np.diff(prior.positions, axis=0)
-        along /= np.hypot(*along.T)[:, None]
-        segment = np.minimum(points.place.astype(np.int64), len(along) - 1)
-        part, innovation = points.place - segment, points.innovation
-        direction = np.column_stack([-along[segment, 1], along[segment, 0]])
-        precision = points.weight * points.share / points.variance
-        independent = float((points.weight * points.share).sum())
-        if np.isfinite(points.end[1]):
-            segment, part = np.append(segment, len(along) - 1), np.append(part, 1.0)
-            direction, innovation = np.vstack([direction, along[-1]]), np.append(innovation, points.end[0])
-            precision, independent = np.append(precision, 1.0 / points.end[1]), independent + 1.0
-
-        def measured(nodes: Points) -> Vector:
-            between = (1.0 - part)[:, None] * nodes[segment] + part[:, None] * nodes[segment + 1]
-            return np.asarray(np.einsum("pa,pa->p", direction, between))
-
-        left, by = innovation - measured(self.work.moved), measured(derivative)
-        pull = (precision * by)[:, None] * direction
-        force = np.zeros_like(derivative)
-        np.add.at(force, segment, (1.0 - part)[:, None] * pull)
-        np.add.at(force, segment + 1, part[:, None] * pull)
-        force[self.work.known] = 0.0
-        solved = np.zeros(len(self.work.solver.band))
-        solved[: force.size] = force.ravel() / scale
-        banded.substitute(AXES, self.work.solver.band, solved)
-        corrected = derivative - solved[: force.size].reshape(-1, 2)
-        return Sensitivity(
-            corrected,
-            float((force * corrected).sum()),
-            float(precision @ (left * by)),
-            float(precision @ (left * innovation)),
-            independent,
-        )
+            problem = f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
+        elif not residual <= RESIDUAL_TOLERANCE or off > 1.0:
+            problem = f"the correction was not solved: residual {residual:.1e}, off by {off:.1g}"
+        shown = np.unique(np.minimum(points.place.astype(np.int64), segments - 1))
+        arrays = work.about.copy(), work.moved.copy(), work.covariance.copy()
+        return Correction(problem, residual, *arrays, 1.0 - len(shown) / segments)

@@ -7,29 +7,20 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator import association, noise
-from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
+from magnetosuture_thread.estimator.correction import Correction, Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
-from magnetosuture_thread.estimator.stiffness import (
-    AUTOMATIC,
-    STIFFNESS_OVER_DRAG,
-    LearnedState,
-    SlowParameter,
-    StiffnessLearner,
-)
-from magnetosuture_thread.geometry.barrier import BUILT_IN, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.thread.margins import SOLID, Margins
-from magnetosuture_thread.thread.material import Thread
+from magnetosuture_thread.thread.margins import SOLID, BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
@@ -49,21 +40,12 @@ class EstimatorOptions:
 
     Attributes:
         history: how late an observation may come [s].
-        slow_parameters: what is learned of the thread on line: nothing, `stiffness_over_drag`, or `auto`: stiffness
-            over drag, from the first time on that the thread moves as the model cannot explain.
 
     Raises:
-        ConfigurationError: a value is out of bounds, or a parameter is unknown.
+        ConfigurationError: it is out of bounds.
     """
 
     history: Annotated[float, bounded("s", 1e-3, 1e5)] = 1.0
-    slow_parameters: tuple[str, ...] = (AUTOMATIC,)
-
-    def __post_init__(self) -> None:
-        """Check the names."""
-        if self.slow_parameters not in ((), (AUTOMATIC,), (STIFFNESS_OVER_DRAG,)):
-            expected = f"{STIFFNESS_OVER_DRAG} or {AUTOMATIC} alone, or nothing"
-            raise ConfigurationError("estimator.slow_parameters", list(self.slow_parameters), expected)
 
 
 @dataclass(frozen=True)
@@ -85,8 +67,6 @@ class ThreadEstimate:
         noise: intensity of the process noise in each window, shape (w,) [m^2/s].
         disturbances: what the model does not know.
         problems: why pieces or the whole observation were refused.
-        slow_parameters: what is learned of thread and liquid; empty if nothing is asked for.
-        thread: with what is learned.
         compute_margins: at its positions.
     """
 
@@ -104,9 +84,11 @@ class ThreadEstimate:
     noise: Vector
     disturbances: tuple[Disturbance, ...]
     problems: tuple[str, ...]
-    slow_parameters: tuple[SlowParameter, ...]
-    thread: Thread
     compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything computed, for `copy` and `pickle`."""
+        return {**self.__dict__, "margins": self.margins, "compute_margins": None}
 
     @property
     def stamp(self) -> float:
@@ -119,7 +101,9 @@ class ThreadEstimate:
         return self.compute_margins()
 
 
-def clearance_bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
+def clearance_bound(
+    nodes: NDArray[Any], gradient: NDArray[np.float64], clearance: Vector, covariance: Points, neighbours: bool = False
+) -> Vector:
     """Return the one-sided 99 % bound of each margin of a barrier as a distance [m].
 
         clearance - 2.33 sum_k (g_k' C_k g_k)^(1/2) / |g|
@@ -129,21 +113,24 @@ def clearance_bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vecto
     and its neighbours counts: that of a point between two nodes is not greater.
 
     Args:
-        rows: of obstacles, wall or a barrier that a user added.
+        nodes: that each row depends on, shape (m, k).
+        gradient: g_k of each row, shape (m, k, 2).
+        clearance: of each row, shape (m,) [m].
         covariance: of each node, shape (n + 1, 2, 2) [m^2].
+        neighbours: whether the clearance is that of the half segments beside a node too.
     """
-    deviation, gradient = np.zeros(len(rows.clearance)), rows.gradient
-    for apart in (-1, 0, 1) if rows.name in SOLID else (0,):
-        near = covariance[np.clip(rows.nodes + apart, 0, len(covariance) - 1)]
+    deviation = np.zeros(len(clearance))
+    for apart in (-1, 0, 1) if neighbours else (0,):
+        near = covariance[np.clip(nodes.astype(np.int64) + apart, 0, len(covariance) - 1)]
         square = np.einsum("rka,rkab,rkb->rk", gradient, near, gradient)
         deviation = np.maximum(deviation, np.sqrt(np.maximum(square, 0.0)).sum(axis=1))
     slope = np.sqrt(np.einsum("rkd,rkd->r", gradient, gradient))
-    return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
+    return np.asarray(clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
 
 
-@dataclass
+@dataclass(frozen=True)
 class FilterState:
-    """What the next step and correction depend on, besides the predictor.
+    """What the next step and correction depend on, besides the predictor. It is replaced and never written to.
 
     Attributes:
         errors: variance and density of each node, see `noise`, shape (2, n + 1) [D^2].
@@ -166,8 +153,8 @@ class FilterState:
     prediction: Prediction | None = None
 
 
-Snapshot = tuple[FilterState, NeedlePose | None, ThreadState | None, WarmStart, LearnedState]
-"""Everything that the next step depends on: of the filter, predictor, formulation and stiffness."""
+Snapshot = tuple[FilterState, NeedlePose | None, ThreadState | None, WarmStart]
+"""Everything that the next step depends on: of the filter, predictor and formulation."""
 
 
 class ThreadEstimator:
@@ -200,11 +187,9 @@ class ThreadEstimator:
         # The model's errors are alike over a tenth of the length.
         self._length = max(0.1 * self.thread.segments, 0.5)  # l [D]
         self._corrector = Corrector(predictor, formulation)
-        self._stiffness = StiffnessLearner(predictor, formulation, self.options.slow_parameters)
         self._forget()
 
     def _forget(self) -> None:
-        self._stiffness.reset()
         errors = np.zeros((2, self.thread.segments + 1))
         self._now = FilterState(errors, NoiseModel.new(), DisturbanceTest(self.thread))
 
@@ -243,11 +228,17 @@ class ThreadEstimator:
             InvalidInputError: see `ThreadPredictor.start`.
         """
         prediction = self.predictor.start(pose, centreline, strict=False)
+        seen, known = 0.0, 0.0
+        if centreline is not None:
+            seen, known = float(arc_lengths(centreline)[-1]), LAID_DEVIATION * association.MIN_DEVIATION
         self._forget()
-        now, seen = self._now, 0.0 if centreline is None else float(arc_lengths(centreline)[-1])
-        now.prediction, now.converged, now.unknown = prediction, prediction.converged, centreline is None
-        known = 0.0 if centreline is None else LAID_DEVIATION * association.MIN_DEVIATION
-        now.errors = self._errors_of(seen / self._unit, (known / self._unit) ** 2)
+        self._now = replace(
+            self._now,
+            prediction=prediction,
+            converged=prediction.converged,
+            unknown=centreline is None,
+            errors=self._errors_of(seen / self._unit, (known / self._unit) ** 2),
+        )
         return self._estimate([])
 
     def _errors_of(self, seen: float, variance: float) -> Points:
@@ -275,81 +266,95 @@ class ThreadEstimator:
             SolverError: see `ThreadPredictor.step`.
         """
         before, now = self.predictor.state, self._now
-        now.prediction = prediction = self._stiffness.step(pose)
-        now.converged = prediction.converged
+        prediction, test = self.predictor.step(pose), copy(now.test)
         assert before is not None
         intensity = noise.at_nodes(now.noise.intensity, self.thread.segments + 1)
         intensity[0] = 0.0
         added = np.outer((1.0, 2.0 * self._length), intensity) * (prediction.interval / self._unit**2)
-        now.errors = noise.propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
-        now.test.decay(prediction.interval, self._formulation.nodes_in_contact)
+        errors = noise.propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
+        test.decay(prediction.interval, self._formulation.nodes_in_contact)
+        self._now = replace(now, prediction=prediction, converged=prediction.converged, errors=errors, test=test)
         return self.correct(observation) if observation is not None else self._estimate([])
 
     def correct(self, observation: ThreadObservation) -> ThreadEstimate:
-        """Correct the thread at the last pose by an observation of the same instant."""
-        now, state, pose, unit = self._now, self.predictor.state, self.predictor.pose, self._unit
+        """Correct the thread at the last pose by an observation of the same instant.
+
+        Its points are associated with the thread, the correction is solved, and the noise updated by what is left. The
+        result is kept in the end; where there is no solution, the thread stays where it was predicted.
+        """
+        state, pose = self.predictor.state, self.predictor.pose
         if state is None or pose is None:
             raise InvalidInputError("thread observation", "one before the start", "a centreline first")
+        now, state, points, problems = self._associate(observation, state, pose)
+        innovations, correction = None, None
+        if points is not None:
+            elapsed = pose.stamp - now.measured_at if math.isfinite(now.measured_at) else 0.0
+            learned = noise.learn(now.noise, points, now.errors, self._unit, elapsed, 2.0 * self._length)
+            now, innovations = replace(now, noise=learned[0], errors=learned[2]), learned[1]
+            prior = self._prior(now, state, pose)
+            correction = self._corrector.solve(prior, points)
+            if correction.problem:
+                problems, correction = [*problems, correction.problem], None
+            else:
+                now = self._updated(now, prior, points, correction, pose)
+                state = ThreadState(correction.positions * self._unit, state.velocities, state.interval)
+        self._now, self.predictor.state = now, state
+        return self._estimate(problems, innovations, 0 if points is None else len(points.place), correction)
+
+    def _associate(
+        self, observation: ThreadObservation, state: ThreadState, pose: NeedlePose
+    ) -> tuple[FilterState, ThreadState, association.MeasuredPoints | None, list[str]]:
+        """Return filter and thread before the correction, the points on the thread, and why others are refused."""
+        now, unit = self._now, self._unit
         placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
-        if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
-            state = laid
-            placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
-        points, refused = self._points_of(placed, state)
-        if points is None:
-            return self._estimate(problems + refused)
-        learner, corrector, work = self._stiffness, self._corrector, self._corrector.work
-        if learner.state.active:
-            noise.weigh(points, now.errors[0])
-            if not corrector.solve(self._prior(state, pose), points):
-                state = learner.learn(corrector, state, pose.stamp)
-                again, refused = self._points_of(placed, state)
-                points = again or points
-        problems, count = problems + refused, len(points.place)
-        measured = math.isfinite(now.measured_at)
-        elapsed = pose.stamp - now.measured_at if measured else 0.0
-        now.noise, innovations, now.errors = noise.learn(
-            now.noise, points, now.errors, unit, elapsed, 2.0 * self._length
+        if placed:
+            now, laid = self._laid_along(placed[0], pose, state)
+            if laid is not state:
+                state = laid
+                placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
+        obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
+        points, refused = association.measured_points(
+            placed, state.positions / unit, float(now.errors[0, -1]), now.noise.scale, unit, obstacles
         )
-        prior = self._prior(state, pose)
-        if problem := corrector.solve(prior, points):
-            return self._estimate([*problems, problem], innovations, count)
-        normals = normals_of(prior.positions)
-        now.errors, applied, hidden = noise.take_correction(points, normals, work.moved, work.covariance, prior.density)
-        now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
-        if learner.state.active:
-            learner.correct(corrector, float(now.errors[0].mean()))
-        if measured:  # else there is no earlier time to compare with
+        return now, state, points, problems + refused
+
+    def _updated(
+        self,
+        now: FilterState,
+        prior: Prior,
+        points: association.MeasuredPoints,
+        correction: Correction,
+        pose: NeedlePose,
+    ) -> FilterState:
+        """Return the filter after a correction."""
+        normals, moved, unit, test = normals_of(prior.positions), correction.moved, self._unit, now.test
+        errors, applied = noise.take_correction(points, normals, moved, correction.covariance, prior.density)
+        if math.isfinite(now.measured_at):  # else there is no earlier time to compare with
             # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
             # points of a window share it, and so do both times that the test compares.
             scale, sums = now.noise.scale, now.noise.sums
             variance = sums.own * (1.0 + 0.5 * max(1.0 - scale, MIN_SHARED) / scale * sums.independent) * unit**2
-            now.test.add(work.moved * unit, normals, variance, pose.stamp, np.asarray(pose.deviation))
-        self.predictor.pose = pose
-        self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
-        now.converged, now.unknown, now.measured_at = True, False, pose.stamp
-        return self._estimate(problems, innovations, count, hidden)
-
-    def _points_of(
-        self, placed: list[association.PlacedPiece], state: ThreadState
-    ) -> tuple[association.MeasuredPoints | None, list[str]]:
-        now, nodes = self._now, state.positions / self._unit
-        obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
-        return association.measured_points(
-            placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles
+            test = copy(test)
+            test.add(moved * unit, normals, variance, pose.stamp, np.asarray(pose.deviation))
+        learned = now.noise._replace(error=now.noise.error - unit * applied[:, None])
+        return replace(
+            now, errors=errors, noise=learned, test=test, converged=True, unknown=False, measured_at=pose.stamp
         )
 
-    def _prior(self, state: ThreadState, pose: NeedlePose) -> Prior:
+    def _prior(self, now: FilterState, state: ThreadState, pose: NeedlePose) -> Prior:
         unit, rod = self._unit, self._formulation.rod
         return Prior(
             np.ascontiguousarray(state.positions / unit),
             np.ascontiguousarray(pose.heading, dtype=np.float64),
-            np.maximum(self._now.errors[1], 1e-12),
-            noise.at_nodes(self._now.noise.raised, self.thread.segments + 1) / unit**2,
+            np.maximum(now.errors[1], 1e-12),
+            noise.at_nodes(now.noise.raised, self.thread.segments + 1) / unit**2,
             self._length,
             rod.bending_stiffness / (rod.drag_across * unit**4),
         )
 
-    def _laid_along(self, piece: association.PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
+    def _laid_along(
+        self, piece: association.PlacedPiece, pose: NeedlePose, state: ThreadState
+    ) -> tuple[FilterState, ThreadState]:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
 
         At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
@@ -358,105 +363,106 @@ class ThreadEstimator:
         now, unit, segments = self._now, self._unit, self.thread.segments
         # A piece that begins at the needle and lies more than 1.5 segments off gives the shape itself.
         if not piece.attached or (not now.unknown and piece.square < 1.5**2):
-            now.gross = 0
-            return None
-        now.gross += 1
-        end = piece.start + float(piece.arcs[-1])
+            return replace(now, gross=0), state
+        gross, end = now.gross + 1, piece.start + float(piece.arcs[-1])
         prior = float(np.interp(0.5 * end, np.arange(segments + 1), now.errors[0]))
         measured = math.isfinite(now.measured_at)
-        if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
-            return None
+        if not now.unknown and measured and gross < 2 and piece.square > 9.0 * prior:
+            return replace(now, gross=gross), state
         seen = smoothed_line(piece.points, piece.arcs, 2.0 * association.POINT_CORRELATION / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))
-        self.predictor.pose, self.predictor.state = pose, laid
         # Whether it lies outside of obstacles is not known before it is corrected.
-        now.gross, now.unknown, now.converged = 0, False, False
-        now.errors = self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance)))
-        now.noise, now.test = NoiseModel.new(), DisturbanceTest(self.thread)
-        self._stiffness.restart()
-        return laid
+        now = replace(
+            now,
+            gross=0,
+            unknown=False,
+            converged=False,
+            errors=self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance))),
+            noise=NoiseModel.new(),
+            test=DisturbanceTest(self.thread),
+        )
+        return now, laid
 
     def _estimate(
         self,
         problems: Sequence[str],
         innovations: Innovations | None = None,
         points: int = 0,
-        hidden: float | None = None,
+        correction: Correction | None = None,
     ) -> ThreadEstimate:
-        """Return the estimate; `hidden` is None where the thread was not corrected."""
+        """Return the estimate; `correction` is None where the thread was not corrected."""
         now, pose, state, prediction = self._now, self.predictor.pose, self.predictor.state, self._now.prediction
         assert prediction is not None
         assert pose is not None
         assert state is not None
         formulation, positions, tolerance = self._formulation, state.positions, self.predictor.contact_tolerance
-        corrected = hidden is not None
         # Where innovations are larger than expected, so are the errors that are left.
         scale = self._unit**2 * max(now.noise.ratio, 1.0)
-        if corrected:
-            covariance = scale * self._corrector.work.covariance
+        if correction is not None:
+            covariance = scale * correction.covariance
         else:
             normal = normals_of(positions)
             covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
-        formulation.added.set_time(pose.stamp)
-        added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
-        disturbances = now.test.found(pose.stamp, positions)
-        if corrected and disturbances:
-            self._stiffness.activate()
+        # At once, as barriers may move on before they are asked again.
+        added = formulation.added.rows_at(pose.stamp, positions, pose.heading)
 
         def compute_margins() -> Margins:
-            rows = [*formulation.margins(positions, pose.heading), *added]
-            bounded = [each for each in rows if each.name in SOLID or each.name not in BUILT_IN]
-            bounds = {each.name: clearance_bound(each, covariance) for each in bounded}
-            return Margins.of(rows, tolerance, prediction.scene_version).with_bounds(bounds)
+            margins = formulation.margins(positions, pose.heading)
+            bounds = {
+                solid.barrier: clearance_bound(
+                    solid.node[:, None], solid.normal[:, None], solid.clearance, covariance, neighbours=True
+                )
+                for solid in margins
+                if solid.barrier in SOLID
+            }
+            bounds |= {
+                rows.name: clearance_bound(rows.nodes, rows.gradient, rows.clearance, covariance) for rows in added
+            }
+            margins += [BarrierMargins.from_rows(rows) for rows in added]
+            return Margins.of(margins, tolerance, prediction.scene_version).with_bounds(bounds)
 
         return ThreadEstimate(
             prediction=prediction,
             positions=positions,
             covariance=covariance,
             deviation=np.sqrt(scale * np.maximum(now.errors[0], 0.0)),
-            corrected=corrected,
+            corrected=correction is not None,
             unmeasured_for=pose.stamp - now.measured_at,
             converged=now.converged,
-            residual=self._corrector.residual if corrected else 0.0,
+            residual=0.0 if correction is None else correction.residual,
             points=points,
-            hidden=1.0 if hidden is None else hidden,
+            hidden=1.0 if correction is None else correction.hidden,
             innovations=innovations,
             noise=now.noise.intensity,
-            disturbances=disturbances,
+            disturbances=now.test.found(pose.stamp, positions),
             problems=tuple(problems),
-            slow_parameters=self._stiffness.report(),
-            thread=self._stiffness.thread,
             compute_margins=compute_margins,
         )
 
     def snapshot(self) -> Snapshot:
         """Return everything that the next step depends on."""
-        now, predictor = replace(self._now, test=copy(self._now.test)), self.predictor
-        return now, predictor.pose, predictor.state, self._formulation.warm_start(), self._stiffness.state
+        predictor = self.predictor
+        return self._now, predictor.pose, predictor.state, self._formulation.warm_start()
 
     def restore(self, kept: Snapshot) -> None:
         """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
-        now, self.predictor.pose, self.predictor.state, warm_start, learned = kept
-        self._now = replace(now, test=copy(now.test))
+        self._now, self.predictor.pose, self.predictor.state, warm_start = kept
         self._formulation.restore(warm_start)
-        self._stiffness.restore(learned)
 
     def follow_on(self, other: ThreadEstimator) -> None:
         """Continue from the estimate of another thread, in another scene or with other options; a step comes next.
 
-        What was learned of the stiffness and added up for disturbances stays with the thread that it is of.
+        What was added up for disturbances stays with the thread that it is of.
         """
         self.reset()
         self.predictor.follow_on(other.predictor)
-        (kept, *_, learned), (old, new) = other.snapshot(), (other._unit, self._unit)
+        kept, old, new = other.snapshot()[0], other._unit, self._unit
         at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
         errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
         test = kept.test if self.thread == other.thread else self._now.test
         self._now = replace(kept, errors=errors, test=test, prediction=None)
-        if self.thread == other.thread and self.options.slow_parameters == other.options.slow_parameters:
-            self._stiffness.restore(learned)
 
 
 def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:

@@ -271,8 +271,8 @@ def raised_intensity(
 
 def take_correction(
     points: MeasuredPoints, normals: Points, moved: Points, covariance: NDArray[np.float64], density: Vector
-) -> tuple[Points, Vector, float]:
-    """Return variance and density after a correction, what each window was moved by, and the part that is hidden.
+) -> tuple[Points, Vector]:
+    """Return variance and density after a correction, and what each window was moved by.
 
     Args:
         points: the points, with their robust weights.
@@ -293,4 +293,4 @@ def take_correction(
     left = np.zeros((2, segments + 1))
     left[0] = np.einsum("ia,iab,ib->i", normals, covariance, normals)
     left[1, 1:] = 1.0 / (1.0 / density[1:] + gained[1:])
-    return left, applied, 1.0 - len(np.unique(low)) / segments
+    return left, applied

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
-from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG
 from magnetosuture_thread.geometry.barrier import Barrier, load_barriers
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings import shared_parameters as shared
@@ -164,11 +163,6 @@ class ThreadModelSettings(
     estimator_history: float = quantity(
         EstimatorOptions.history, "how late an observation of the thread may come", "s", 0.05, 5.0
     )
-    estimator_slow_parameters: tuple[str, ...] = quantity(
-        EstimatorOptions.slow_parameters,
-        "what the estimator learns: stiffness_over_drag, nothing, or auto: that, once the model is found wrong",
-        choices=(AUTOMATIC, STIFFNESS_OVER_DRAG),
-    )
     forecast_horizon: float = quantity(
         0.0, "how far ahead thread/forecast looks, by the plan or the command held; 0 for none", "s", 0.0, 30.0
     )
@@ -209,8 +203,6 @@ class ThreadModelSettings(
             raise self.refused("forecast_horizon", f"0, or at least forecast_step, {self.forecast_step:g} s")
         if max(self.fixed_nodes, default=0) > segments:
             raise self.refused("fixed_nodes", f"nodes from 1 to {segments}")
-        if len(self.estimator_slow_parameters) > 1:
-            raise self.refused("estimator_slow_parameters", "one name, or none")
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
@@ -301,7 +293,7 @@ class ThreadModelSettings(
         """
         if not self.is_estimated:
             return None
-        options = EstimatorOptions(self.estimator_history, self.estimator_slow_parameters)
+        options = EstimatorOptions(self.estimator_history)
         ThreadEstimator(self._in_the_void(scene), options).warm_up()
         barriers = load_barriers(self.barriers, f"{self.GROUP}.barriers")
         return EstimatorSession(ThreadEstimator(self._predictor(scene, barriers), options))

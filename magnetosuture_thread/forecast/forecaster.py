@@ -17,17 +17,17 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.rollout import (
     KINDS,
     NEEDLE_MARGIN,
-    NO_CONTACT,
+    NO_SHAPE,
     OBSTACLE_MARGIN,
+    WALL_MARGIN,
     DragData,
-    FrictionData,
-    RolloutBuffers,
-    RolloutModel,
-    RolloutRecord,
-    RolloutState,
-    roll_out,
+    empty_margins,
+    least_margins,
+    nodes_under_friction,
+    step_needle,
 )
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
+from magnetosuture_thread.geometry.compiled import TypedKernel
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.geometry.scene import Scene
@@ -37,10 +37,9 @@ from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInpu
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
-from magnetosuture_thread.thread.predictor import MAX_STEP_LENGTH, ThreadPredictor
-from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
-from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation
-from magnetosuture_thread.thread.solvers import BandedSolver
+from magnetosuture_thread.thread.predictor import PredictorOptions, ThreadPredictor
+from magnetosuture_thread.thread.program import ABOUT, CONTACTS_PER_NODE, Table
+from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation, StepInput
 from magnetosuture_thread.thread.step import WarmStart
 
 Vector = NDArray[np.float64]
@@ -66,7 +65,6 @@ class ForecastStart:
         needle_force: of the thread upon the needle, shape (2,) [N], from which a needle with drag goes on; None if it
             is not known.
         warm_start: of the formulation, which brings friction that holds already; None for none.
-        thread: with the stiffness, rest curvature and drag to forecast with; None for the forecaster's own.
     """
 
     pose: NeedlePose
@@ -76,13 +74,12 @@ class ForecastStart:
     tip_velocity: Vector | None = None
     warm_start: WarmStart | None = None
     needle_force: Vector | None = None
-    thread: Thread | None = None
 
     @classmethod
     def of_estimate(
         cls, estimate: ThreadEstimate, pose: NeedlePose, tip_velocity: Vector | None = None
     ) -> ForecastStart:
-        """Return the start from an estimate, with what the estimator has learned of the thread.
+        """Return the start from an estimate.
 
         Args:
             estimate: of the thread.
@@ -91,8 +88,7 @@ class ForecastStart:
         """
         forces = estimate.prediction.forces
         needle_force = None if forces is None else forces.needle_force
-        positions = estimate.positions
-        return cls(pose, positions, tip_velocity=tip_velocity, needle_force=needle_force, thread=estimate.thread)
+        return cls(pose, estimate.positions, tip_velocity=tip_velocity, needle_force=needle_force)
 
     @classmethod
     def of_predictor(
@@ -178,7 +174,10 @@ class Forecast:
         problem: why the forecast ends before its horizon; empty if it does not.
         shapes: names of the scene's shapes, then "wall".
         scene_version: of the scene; empty where there is none.
-        record: of compiled code, of at least as many steps.
+        margin_nodes: where the margins are, shape (k + 1, 5), in the order of the margins.
+        margin_shapes: and of which shape, an index of `shapes`.
+        contact_tolerance: the thread touches a shape or the wall to which it is this close [m].
+        touched: shapes that changed the filtered velocity in each step, shape (k, s + 1).
     """
 
     stamp: float
@@ -197,7 +196,10 @@ class Forecast:
     problem: str
     shapes: tuple[str, ...]
     scene_version: str
-    record: RolloutRecord = field(repr=False)
+    margin_nodes: NDArray[np.int64] = field(repr=False)
+    margin_shapes: NDArray[np.int64] = field(repr=False)
+    contact_tolerance: float
+    touched: NDArray[np.bool_] = field(repr=False)
 
     @property
     def horizon(self) -> float:
@@ -211,11 +213,9 @@ class Forecast:
 
     def _minimum(self, kind: int, name: str) -> ForecastMargin:
         at = int(self.margins[name].argmin())
-        value, shape = float(self.margins[name][at]), int(self.record.shape[at, kind])
-        named = np.isfinite(value) and (kind in (OBSTACLE_MARGIN, NEEDLE_MARGIN) or name == WALL_NAME)
-        return ForecastMargin(
-            value, float(self.times[at]), int(self.record.node[at, kind]), self.shapes[shape] if named else ""
-        )
+        value, shape = float(self.margins[name][at]), int(self.margin_shapes[at, kind])
+        named = self.shapes[shape] if shape != NO_SHAPE else ""
+        return ForecastMargin(value, float(self.times[at]), int(self.margin_nodes[at, kind]), named)
 
     @cached_property
     def friction_nodes(self) -> tuple[int, ...]:
@@ -241,12 +241,15 @@ class Forecast:
     @cached_property
     def first_contact(self) -> ForecastContact | None:
         """When the thread first touches a shape or the wall, and which; None if it does not."""
-        contact = self.record.contact[: len(self.times)]
-        found = np.flatnonzero(contact[:, 0] != NO_CONTACT)
-        if not len(found):
+        both = [self.margins[KINDS[kind]] for kind in (OBSTACLE_MARGIN, WALL_MARGIN)]
+        touches = np.flatnonzero(np.min(both, axis=0) <= self.contact_tolerance)
+        if not len(touches):
             return None
-        at = int(found[0])
-        return ForecastContact(float(self.times[at]), int(contact[at, 1]), self.shapes[int(contact[at, 0])])
+        at, kind = int(touches[0]), WALL_MARGIN
+        if both[0][at] <= both[1][at]:
+            kind = OBSTACLE_MARGIN
+        node, shape = int(self.margin_nodes[at, kind]), int(self.margin_shapes[at, kind])
+        return ForecastContact(float(self.times[at]), node, self.shapes[shape])
 
     @cached_property
     def rest_time(self) -> float | None:
@@ -261,8 +264,7 @@ class Forecast:
         """Names of the shapes, and "wall", at which it comes to rest; empty if it does not."""
         if self.rest_time is None:
             return ()
-        touched = self.record.touched[len(self.filtered) - 1]
-        return tuple(name for name, active in zip(self.shapes, touched.tolist(), strict=True) if active)
+        return tuple(name for name, active in zip(self.shapes, self.touched[-1].tolist(), strict=True) if active)
 
 
 @checked_arguments("needle drag")
@@ -296,12 +298,11 @@ class NeedleDrag:
     turning: Annotated[float, bounded("N m s", 1e-20)]
     thread: float | None = None
 
-    def data(self, thread: Thread, learned: Thread | None = None) -> DragData:
+    def data(self, thread: Thread) -> DragData:
         """Return it for compiled code.
 
         Args:
-            thread: with which `along` was measured.
-            learned: that is driven, as the estimator has learned it; None for the same.
+            thread: that is driven, with which `along` was measured.
 
         Raises:
             ConfigurationError: the thread's part is not less than the whole.
@@ -309,9 +310,64 @@ class NeedleDrag:
         part = thread.medium.drag_along * thread.length if self.thread is None else self.thread
         if not 0.0 <= part < self.along:
             raise ConfigurationError("needle drag along", self.along, f"more than the thread's part, {part:g} N s/m")
-        driven = learned or thread
-        whole = driven.medium.drag_across * driven.length
-        return DragData(self.along, self.along - part, self.across, self.turning, whole)
+        whole = thread.medium.drag_across * thread.length
+        return DragData(*map(float, (self.along, self.along - part, self.across, self.turning, whole)))
+
+
+class _ThreadWalk:
+    """The thread of one forecast, a step after the other.
+
+    Attributes:
+        positions: of all nodes, shape (n + 1, 2) [m].
+        converged: whether every step ended where the barriers themselves hold.
+    """
+
+    def __init__(
+        self, formulation: RodFormulation, start: ForecastStart, nodes: NDArray[np.int64], options: PredictorOptions
+    ) -> None:
+        self._formulation, self._nodes, self._options = formulation.separate(), nodes, options
+        if start.warm_start is not None and start.interval > 0.0:
+            self._formulation.restore(start.warm_start)
+        still = np.zeros_like(start.vertices) if start.velocities is None else start.velocities
+        self.positions, self._velocities = np.array([start.vertices, still], np.float64)
+        self._ends, self._interval, self.converged = self.positions[nodes], float(start.interval), True
+
+    def step(self, tail: Vector, before: Vector, heading: Vector, interval: float) -> str:
+        """Follow the point where the thread is fixed, in as many steps as `ThreadPredictor`; return what fails.
+
+        Args:
+            tail: where that point is after the step, shape (2,) [m].
+            before: heading of the needle before it, shape (2,).
+            heading: and after it.
+            interval: duration [s].
+        """
+        begin, end, formulation = self.positions[0].copy(), self._ends.copy(), self._formulation
+        end[0] = tail
+        count = self._options.substeps(interval, math.dist(begin.tolist(), tail.tolist()) / formulation.rod.unit)
+        ends, mixed = end, heading
+        for index in range(1, count + 1):
+            if count > 1:
+                part, ends = index / count, end.copy()
+                ends[0] = begin + part * (tail - begin)
+                mixed = (1.0 - part) * before + part * heading
+                size = math.hypot(*mixed.tolist())
+                mixed = mixed / size if size > 1e-6 else heading
+            moved = self._nodes, ends, mixed, interval / count, self._interval
+            progress = formulation.solve(StepInput(self.positions, self._velocities, *moved))
+            if progress.code != ENDED:
+                self.converged = False
+                room = f"more than {CONTACTS_PER_NODE * len(self.positions)} contacts at once"
+                return room if progress.code == NO_ROOM else "a step has no solution within the tolerance"
+            (self.positions, self._velocities), self._interval = formulation.buffers.end, interval / count
+            self.converged = self.converged and progress.off <= 1.0
+        return ""
+
+    def write_forces(self, heading: Vector, tension: Vector, pull: Vector) -> None:
+        """Write the tension of each segment and the thread's pull upon the needle [N]."""
+        buffers = self._formulation.buffers
+        loads = buffers.internal, buffers.tail_load
+        moved = buffers.motion[ABOUT], self._velocities, self._interval
+        self._formulation.write_forces(*moved, heading, loads, tension, pull)
 
 
 class ThreadForecaster:
@@ -325,8 +381,8 @@ class ThreadForecaster:
     filtered by the needle's safety filter at its pose, the needle follows the filtered velocity, exactly unless its
     drag is given, and the thread follows the needle by one step of the formulation `rod`, divided as `ThreadPredictor`
     divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and `ThreadPredictor` by hand,
-    but for rounding; it is compiled from end to end. Where the structured solver does not get on with a step, the
-    forecast ends there and says so, as no general solver is tried. Several threads may forecast at once.
+    but for rounding. Where the structured solver does not get on with a step, the forecast ends there and says so, as
+    no general solver is tried. Several threads may forecast at once.
 
     Args:
         thread: the thread.
@@ -371,34 +427,25 @@ class ThreadForecaster:
             raise ConfigurationError("safety filter's scene", safety.scene.version, expected)
         numbers: dict[str, Any] = {"margin_range": 2e-3, **options}
         predictor = ThreadPredictor(thread, scene, fixed_nodes=fixed_nodes, **numbers)
-        chosen, formulation, friction = predictor.options, predictor.formulation, FrictionData()
+        self.options, formulation = predictor.options, predictor.formulation
         assert isinstance(formulation, RodFormulation)
-        if law is not None:
-            if law.threshold > chosen.margin_range:
-                expected = f"at least the friction threshold {law.threshold:g} m"
-                raise ConfigurationError("margin_range", chosen.margin_range, expected)
-            friction = FrictionData(law.threshold, law.beta, law.stuck_speed, float(friction_averaging))
-        self.thread, self.scene, self.safety, self.step = thread, scene, safety, step
-        self._formulation, self._drag = formulation, drag
-        reach = chosen.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
-        self._model = RolloutModel(
-            step=formulation.step_model(),
-            around=Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius).data,
-            needle=safety.compiled_data(),
-            offset=np.array(attachment_offset or (0.0, 0.0), np.float64),
-            prescribed=np.array([0, *predictor.fixed_nodes], np.int64),
-            max_step=float(chosen.max_step),
-            max_way=MAX_STEP_LENGTH * thread.segment_length,
-            max_substeps=int(chosen.max_substeps),
-            contact_tolerance=float(chosen.contact_tolerance),
-            friction=friction,
-            drag=DragData() if drag is None else drag.data(thread),
-        )
+        if law is not None and law.threshold > self.options.margin_range:
+            expected = f"at least the friction threshold {law.threshold:g} m"
+            raise ConfigurationError("margin_range", self.options.margin_range, expected)
+        self.thread, self.scene, self.safety, self.step = thread, scene, safety, float(step)
+        self._formulation, self._law, self._averaging = formulation, law, float(friction_averaging)
+        self._needle, self._drag = safety.compiled_data(), DragData() if drag is None else drag.data(thread)
+        self._offset = tuple(float(part) for part in attachment_offset or (0.0, 0.0))
+        self._nodes = np.array([0, *predictor.fixed_nodes], np.int64)
+        reach = self.options.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
+        self._around = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius).data
+        self._step_needle, self._friction_nodes = TypedKernel(step_needle), TypedKernel(nodes_under_friction)
         self._names = (*scene.names, WALL_NAME)
 
     def warm_up(self) -> None:
         """Load the compiled code, by a forecast of one step in the bare dish."""
-        bare = ThreadForecaster(self.thread, Scene(self.scene.dish), step=self.step)
+        scene, reach = Scene(self.scene.dish), self.options.margin_range
+        bare = ThreadForecaster(self.thread, scene, law=self._law, step=self.step, margin_range=reach)
         middle = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
         bare.forecast(bare.straight(middle), np.zeros(2), self.step)
 
@@ -406,7 +453,7 @@ class ThreadForecaster:
         """Return the start of a thread at rest, straight behind the needle, and along the wall where that is near."""
         check_pose(pose)
         radius = self.scene.dish.radius - 0.5 * self.thread.diameter
-        path = lay_behind_needle(self._attached(pose), pose.heading, self.thread.length, radius)
+        path = lay_behind_needle(self._attached(pose.tail, pose.heading), pose.heading, self.thread.length, radius)
         return ForecastStart(pose, chain_inside(path, self.thread.segments, self.thread.segment_length, radius))
 
     def forecast(
@@ -425,86 +472,95 @@ class ThreadForecaster:
             InvalidInputError: start or commands are not finite or of another shape, the needle is inside of a shape or
                 the wall, or the horizon is not between a step and `MAX_HORIZON`.
         """
-        steps = self._steps(horizon)
+        steps, interval = self._steps(horizon), self.step
         self._check_start(start)
         sequence = np.zeros((steps, 2)) if callable(commands) else self._sequence(commands, steps)
-        nodes, state = self.thread.segments + 1, self._begin(start)
-        model, buffers = self._model_of(start, slowed), self._buffers(start)
-        record = RolloutRecord.of(steps, nodes, len(self.scene.shapes))
+        nodes, instants, drag = self.thread.segments + 1, steps + 1, self._drag
+        walk, friction = _ThreadWalk(self._formulation, start, self._nodes, self.options), self._friction(start, slowed)
+        heading = np.asarray(start.pose.heading, np.float64)
+        pose = np.concatenate([np.asarray(start.pose.tail, np.float64), heading / np.linalg.norm(heading)])
+        last = np.array([math.nan, math.nan] if start.tip_velocity is None else start.tip_velocity, np.float64)
+        vertices, poses, filtered = np.empty((instants, nodes, 2)), np.empty((instants, 4)), np.zeros((steps, 2))
+        slowdown, rubbed = np.ones(instants), np.zeros((instants, nodes), np.bool_)
+        tension, pull = np.zeros((instants, nodes - 1)), np.zeros((instants, 2))
+        touched = np.zeros((instants, len(self._names)), np.bool_)
+        margin, margin_nodes, margin_shapes = empty_margins(instants)
+        added, known = np.zeros(3), start.needle_force is not None
         if start.needle_force is not None:
-            record.pull[0] = start.needle_force
-        code, done, asked = ENDED, 0, 1 if callable(commands) else steps
-        while code == ENDED and done < steps:
-            if callable(commands):
-                velocity = commands(done * self.step, state.pose[:2].copy(), state.pose[2:].copy())
-                sequence[done] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
-            code, done = roll_out(model, buffers, state, sequence, self.step, done, done + asked, record)
-        problem, instants = "", done + 1
-        if code == NO_ROOM:
-            problem = f"more than {len(buffers.contacts.node)} contacts at once at {done * self.step:.3f} s"
-        elif code != ENDED:
-            problem = f"the step at {done * self.step:.3f} s has no solution within the tolerance"
+            pull[0] = start.needle_force
+            added[:] = math.nan if drag.along > 0.0 else 0.0  # what is no number is worked out from the force
+        problem, done = "", 0
+        for k in range(instants):
+            vertices[k], poses[k] = walk.positions, pose
+            slowdown[k] = friction(vertices[k], interval, rubbed[k])
+            if k < steps and callable(commands):
+                velocity = commands(k * interval, pose[:2].copy(), pose[2:].copy())
+                sequence[k] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
+            command = tuple(sequence[k].tolist() if k < steps else (0.0, 0.0))
+            pulled = drag if k > 0 or known else DragData()
+            moved = command, float(slowdown[k]), interval, last, pull[k], added, touched[k]
+            least = self._step_needle(self._needle, pulled, pose, *moved)
+            margin[k, NEEDLE_MARGIN], margin_shapes[k, NEEDLE_MARGIN] = least
+            if k == steps:
+                break
+            filtered[k] = last
+            if problem := walk.step(self._attached(pose[:2], pose[2:]), poses[k, 2:], pose[2:], interval):
+                problem = f"{problem} at {k * interval:.3f} s"
+                break
+            walk.write_forces(pose[2:], tension[k + 1], pull[k + 1])
+            done = k + 1
+        instants = done + 1
+        self._write_margins(vertices[:instants], poses[:instants, 2:].copy(), margin, margin_nodes, margin_shapes)
         return Forecast(
             stamp=start.pose.stamp,
-            times=self.step * np.arange(float(instants)),
-            vertices=record.vertices[:instants],
-            tails=record.poses[:instants, :2],
-            headings=record.poses[:instants, 2:],
+            times=interval * np.arange(float(instants)),
+            vertices=vertices[:instants],
+            tails=poses[:instants, :2],
+            headings=poses[:instants, 2:],
             commanded=sequence[:done],
-            filtered=record.filtered[:done],
-            slowdown=record.slowdown[:done],
-            margins={name: record.margin[:instants, kind] for kind, name in enumerate(KINDS)},
-            friction=record.rubbed[:instants],
-            tension=record.tension[:instants],
-            needle_force=record.pull[:instants],
-            converged=bool(record.converged[:instants].all()),
+            filtered=filtered[:done],
+            slowdown=slowdown[:done],
+            margins={name: margin[:instants, kind] for kind, name in enumerate(KINDS)},
+            friction=rubbed[:instants],
+            tension=tension[:instants].max(axis=1),
+            needle_force=pull[:instants],
+            converged=walk.converged,
             problem=problem,
             shapes=self._names,
             scene_version=self.scene.version,
-            record=record,
+            margin_nodes=margin_nodes,
+            margin_shapes=margin_shapes,
+            contact_tolerance=self.options.contact_tolerance,
+            touched=touched[:done],
         )
 
-    def _model_of(self, start: ForecastStart, slowed: bool) -> RolloutModel:
-        """Return the constants of a forecast that starts with this thread."""
-        model, thread = self._model, start.thread
-        if not slowed:  # which nodes are under friction stays
-            model = model._replace(friction=model.friction._replace(beta=1.0))
-        if thread is None or thread is self.thread:
-            return model
-        model = model._replace(step=model.step._replace(rod=self._formulation.rod_of(thread)))
-        return model if self._drag is None else model._replace(drag=self._drag.data(self.thread, thread))
+    def _friction(self, start: ForecastStart, slowed: bool) -> Callable[[Points, float, NDArray[np.bool_]], float]:
+        """Return the friction law over one forecast: it writes the nodes under friction, and returns the slowdown."""
+        law, nodes, averaging = self._law, self.thread.segments + 1, self._averaging
+        contacts, close, (last, velocities) = self._contacts(), np.zeros(nodes, np.int64), np.zeros((2, nodes, 2))
+        share = 1.0 - math.exp(-self.step / averaging) if averaging > 0.0 else 1.0
 
-    def _begin(self, start: ForecastStart) -> RolloutState:
-        """Return the state at the start."""
-        vertices = np.array(start.vertices, np.float64, order="C")
-        velocities = np.zeros_like(vertices) if start.velocities is None else np.array(start.velocities, np.float64)
-        heading = np.asarray(start.pose.heading, np.float64)
-        pulled = self._drag is not None and start.needle_force is not None
-        x, y = (math.nan, math.nan) if start.tip_velocity is None else np.asarray(start.tip_velocity).tolist()
-        return RolloutState(
-            vertices,
-            np.ascontiguousarray(velocities),
-            np.zeros_like(vertices),
-            np.concatenate([np.asarray(start.pose.tail, np.float64), heading / np.linalg.norm(heading)]),
-            np.array([x, y, start.interval]),
-            np.full(3, math.nan if pulled else 0.0),  # what is no number is worked out from the force
-        )
+        def slowdown(vertices: Points, interval: float, rubbed: NDArray[np.bool_]) -> float:
+            if law is None:
+                return 1.0
+            limit = law.threshold + 0.5 * self.thread.diameter
+            motion = vertices, last, velocities, share, interval
+            count, fastest = self._friction_nodes(*motion, self._around, limit, contacts, close, rubbed)
+            return law.beta**count if count and slowed and fastest > law.stuck_speed else 1.0
 
-    def _buffers(self, start: ForecastStart) -> RolloutBuffers:
-        """Return buffers as the step before the start left them."""
-        segments, prescribed = self.thread.segments, len(self._model.prescribed)
-        step = self._formulation.new_buffers()
-        if start.warm_start is not None and start.interval > 0.0:
-            step.restore(start.warm_start)
-        return RolloutBuffers(
-            step=step,
-            solver=BandedSolver().buffers(segments + 1, 2, len(step.program.first)),
-            contacts=Contacts.room((CONTACTS_PER_NODE + 2 * len(self.scene.shapes)) * (segments + 1), 2),
-            ends=np.zeros((3, prescribed, 2)),
-            pose=np.zeros(6),
-            tension=np.zeros(segments),
-            close=np.zeros(segments + 1, np.int64),
-        )
+        last[:] = start.vertices
+        return slowdown
+
+    def _write_margins(self, vertices: Table, headings: Points, *margins: NDArray[Any]) -> None:
+        """Write the least margins of the thread at each instant; see `least_margins`."""
+        segments = self.thread.segments
+        memory = self._contacts(), np.empty((segments + 1, 2)), np.empty((5, segments))
+        if not least_margins(self._formulation.rod, self._around, vertices, headings, *memory, *margins):
+            raise InvalidInputError("scene", "more contacts than there is memory for", "fewer shapes")
+
+    def _contacts(self) -> Contacts:
+        """Return memory for all contacts of the thread's nodes."""
+        return Contacts.room((CONTACTS_PER_NODE + 2 * len(self.scene.shapes)) * (self.thread.segments + 1), 2)
 
     def _steps(self, horizon: float) -> int:
         if not bounded("s", 0.5 * self.step, MAX_HORIZON).within(horizon):
@@ -521,9 +577,12 @@ class ThreadForecaster:
         # A copy, as views of broadcasts are read-only, which is another type for compiled code.
         return np.array(np.broadcast_to(given, (steps, 2)), order="C")
 
-    def _attached(self, pose: NeedlePose) -> Vector:
-        (x, y), (along, left) = pose.heading, self._model.offset
-        return np.asarray(pose.tail + np.array([along * x - left * y, along * y + left * x]))
+    def _attached(self, tail: Vector, heading: Vector) -> Vector:
+        """Return where the thread is fixed, shape (2,) [m]."""
+        if not any(self._offset):
+            return tail
+        (x, y), (along, left) = heading, self._offset
+        return np.asarray(tail + np.array([along * x - left * y, along * y + left * x]))
 
     def _check_start(self, start: ForecastStart) -> None:
         pose, nodes = start.pose, (self.thread.segments + 1, 2)
@@ -531,11 +590,8 @@ class ThreadForecaster:
         finite_array("thread's nodes", start.vertices, nodes, bounded("m", -10.0, 10.0))
         if start.velocities is not None:
             finite_array("thread's velocities", start.velocities, nodes, bounded("m/s", -10.0, 10.0))
-        own, given = self.thread, start.thread or self.thread
-        fixed = ("length", "segments", "diameter", "attachment")
-        if any(getattr(given, name) != getattr(own, name) for name in fixed):
-            raise InvalidInputError("thread of the start", given, f"one like {own} in {', '.join(fixed)}")
-        gap, unit = float(np.linalg.norm(start.vertices[0] - self._attached(pose))), self.thread.segment_length
+        fixed, unit = self._attached(pose.tail, pose.heading), self.thread.segment_length
+        gap = float(np.linalg.norm(start.vertices[0] - fixed))
         if gap > unit:
             wanted = f"at most {unit:.2e} m"
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from where it is fixed", wanted)

@@ -78,6 +78,8 @@ class Barrier(ABC):
         gain: alpha, how fast h may decay towards 0 [1/s]; inf only asks for h >= 0 at the end of each step.
         slack_weight: W of the slack that lets a row give way; inf makes it hard.
         ros_time: time of the next evaluation by the clock of the poses' stamps, set before `set_time` is called [s].
+        needle: at that time, the point where the thread is fixed [m] and the needle's heading, a unit vector, shapes
+            (d,); None where a `NeedleSafetyFilter` evaluates the barrier, and in `check_gradient`.
 
     Source: A. D. Ames et al., Control Barrier Functions: Theory and Applications, 2019, section II, in discrete time.
     """
@@ -86,6 +88,7 @@ class Barrier(ABC):
     gain: float = math.inf
     slack_weight: float = math.inf
     ros_time: float = 0.0
+    needle: tuple[Points, Points] | None = None
 
     def set_time(self, time: float) -> None:  # noqa: B027 - most barriers do not move
         """Set the time of the next evaluation; a barrier that moves overrides this.
@@ -99,9 +102,9 @@ class Barrier(ABC):
         """Whether the barrier moves with time."""
         return type(self).set_time is not Barrier.set_time
 
-    def move_to(self, stamp: float, first: float) -> None:
-        """Set both times: the stamp of the next evaluation, and by that of the first pose the time since [s]."""
-        self.ros_time = stamp
+    def move_to(self, stamp: float, first: float, needle: tuple[Points, Points] | None = None) -> None:
+        """Set the needle and both times, the next evaluation's stamp and what has passed since the first pose [s]."""
+        self.ros_time, self.needle = stamp, needle
         self.set_time(stamp - first)
 
     def rows_after(self, before: Points, positions: Points) -> BarrierRows:

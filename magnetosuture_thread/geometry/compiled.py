@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import json
-import os
+import inspect
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
@@ -15,8 +16,8 @@ import numba
 from numba.core import event
 
 PACKAGE = Path(__file__).parents[1]
-COMPILED_MARK = b"magnetosuture_thread.geometry.compiled"
-_IMPORT = re.compile(rb"^\s*(?:from|import) magnetosuture_thread\.([\w.]+)", re.MULTILINE)
+# A module, and the names after `import`, which may be modules too.
+_IMPORT = re.compile(rb"^\s*from magnetosuture_thread\.([\w.]+) import (?=\(?([\w\s,]+))", re.MULTILINE)
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -30,17 +31,52 @@ class _Decorator(Protocol):
     def __call__(self, function: _Function, /) -> _Function: ...
 
 
-def _decorator(**options: Any) -> _Decorator:
+@cache
+def _read(path: Path, package: Path) -> tuple[bytes, frozenset[Path]]:
+    """Return the digest of a source file, and the files of the package that it imports."""
+    text, files = path.read_bytes(), set[Path]()
+    for module, names in _IMPORT.findall(text):
+        place = package.joinpath(*module.decode().split("."))
+        submodules = {(place / name.strip().decode()).with_suffix(".py") for name in re.split(rb"[\s,]+", names)}
+        files |= {place.with_suffix(".py"), place / "__init__.py"} | submodules
+    return hashlib.sha256(text).digest(), frozenset(file for file in files if file.is_file())
+
+
+def source_digest(path: Path, package: Path = PACKAGE) -> str:
+    """Return a digest of a source file and of all files of the package that it imports, directly or not.
+
+    Compiled code contains the functions and constants that it uses, from other files too.
+    """
+    reached, waiting = {path}, [path]
+    while waiting:
+        new = _read(waiting.pop(), package)[1] - reached
+        reached |= new
+        waiting += new
+    return hashlib.sha256(b"".join(_read(file, package)[0] for file in sorted(reached))).hexdigest()
+
+
+def _decorator(*, keeps: bool = False, **options: Any) -> _Decorator:
     """Return numba's decorator with numpy's rules for division by zero and, but for what is inlined, a cache.
 
     Options are said of every function, as numba takes them over from whatever calls one first where they are not.
     Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
     """
     decorator = cast(Any, numba.njit)  # the stubs do not know all options
-    return cast(_Decorator, decorator(error_model="numpy", no_cfunc_wrapper=True, **options))
+
+    def decorate(function: _Function) -> _Function:
+        dispatcher = decorator(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
+        if keeps:
+            # Where neither the package nor the user's cache can be written, each process compiles for itself.
+            with suppress(RuntimeError):
+                dispatcher.enable_caching()
+                # numba itself looks at the function's own file only, and would run old code of the others.
+                dispatcher._cache._cache_file._source_stamp = source_digest(Path(inspect.getfile(function)))
+        return cast(_Function, dispatcher)
+
+    return decorate
 
 
-compiled = _decorator(cache=True, _nrt=True)
+compiled = _decorator(keeps=True, _nrt=True)
 """Compile a function at its first call.
 
 The result is cached beside the source file, so that only the first start of a node on a machine compiles.
@@ -54,14 +90,14 @@ array of a tuple is counted twice a call, by atomic operations, which took six t
 were looked for. numba does not document `_nrt`; one that has it no longer would refuse it by its name.
 """
 
-compiled_uncounted = _decorator(cache=True, _nrt=False)
+compiled_uncounted = _decorator(keeps=True, _nrt=False)
 """Compile a function as `compiled` does, without counting references to arrays; see `compiled_inline`.
 
 For kernels of which a step calls dozens with tuples of arrays. They may neither make arrays, which numba refuses,
 nor return any, whose references nobody would have counted.
 """
 
-compiled_inner = _decorator(cache=True, _nrt=False, no_cpython_wrapper=True)
+compiled_inner = _decorator(keeps=True, _nrt=False, no_cpython_wrapper=True)
 """Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash."""
 
 compiled_within = _decorator(inline="always", _nrt=False)
@@ -71,13 +107,13 @@ What is compiled apart is compiled once by itself, and then again within each ke
 with one caller; the same done for one with several would compile it in each.
 """
 
-compiled_without_gil = _decorator(cache=True, _nrt=True, nogil=True)
+compiled_without_gil = _decorator(keeps=True, _nrt=True, nogil=True)
 """Compile a function as `compiled` does, to run without Python's lock: several threads then run it at once.
 
 For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
 """
 
-compiled_uncounted_without_gil = _decorator(cache=True, _nrt=False, nogil=True)
+compiled_uncounted_without_gil = _decorator(keeps=True, _nrt=False, nogil=True)
 """Compile a function as `compiled_uncounted` does, to run without Python's lock; see `compiled_without_gil`."""
 
 
@@ -86,57 +122,34 @@ def compilations() -> int:
     return len(_COMPILATIONS.buffer)
 
 
-def _dependencies(package: Path) -> dict[Path, set[Path]]:
-    """Return each source file that has compiled functions, with all files of the package that it imports and itself."""
-    imports: dict[Path, set[Path]] = {}
-    kernels: set[Path] = set()
-    for path in package.rglob("*.py"):
-        text = path.read_bytes()
-        if COMPILED_MARK in text:
-            kernels.add(path)
-        found = {package.joinpath(*module.decode().split(".")).with_suffix(".py") for module in _IMPORT.findall(text)}
-        imports[path] = {file if file.exists() else file.with_suffix("") / "__init__.py" for file in found}
-    closure: dict[Path, set[Path]] = {}
-    for path in kernels:
-        reached, waiting = {path}, [path]
-        while waiting:
-            new = imports.get(waiting.pop(), set()) - reached
-            reached |= new
-            waiting += new
-        closure[path] = {file for file in reached if file in imports}
-    return closure
+class TypedKernel:
+    """A compiled function whose arguments have the same types in every call: these are determined in the first alone.
 
+    numba determines the types of arguments in each call, and of named tuples in Python: 20 us for the sixty arrays of
+    a step's buffers, which is longer than the step of a thread takes. The types have to be the same each time: numbers
+    are floats or integers, arrays contiguous.
 
-def delete_stale_cache(package: Path = PACKAGE) -> bool:
-    """Delete cached functions of files of which any import has changed since; return whether there were such files.
-
-    numba checks the file of a function only. But a compiled function contains the code of all functions and constants
-    that it uses, from other files too, and would keep their old values.
+    Args:
+        kernel: the compiled function.
     """
 
-    def state_of(files: Iterable[Path]) -> str:
-        told = ((file.relative_to(package), file.stat()) for file in sorted(files))
-        return hashlib.sha256("".join(f"{n} {s.st_mtime_ns} {s.st_size}\n" for n, s in told).encode()).hexdigest()
+    def __init__(self, kernel: Callable[..., Any]) -> None:
+        self._kernel: Any = kernel
+        self._code: Any = None
 
-    stamp = package / "__pycache__" / "kernels.json"
-    before: dict[str, str] = {}
-    with contextlib.suppress(OSError, ValueError):
-        before = dict(json.loads(stamp.read_text()))
-    states = {"package": state_of(package.rglob("*.py"))}
-    if before.get("package") == states["package"]:
-        return False
-    states |= {str(path.relative_to(package)): state_of(files) for path, files in _dependencies(package).items()}
-    stale = [package / name for name in states if name != "package" and before.get(name) != states[name]]
-    # Where nothing can be written, there is no such cache either: numba's is then in the user's home.
-    with contextlib.suppress(OSError):
-        for path in stale:
-            for kernel in path.parent.glob(f"__pycache__/{path.stem}.*.nb[ci]"):
-                kernel.unlink(missing_ok=True)
-        stamp.parent.mkdir(exist_ok=True)
-        written = stamp.with_suffix(f".{os.getpid()}")
-        written.write_text(json.dumps(states))
-        written.replace(stamp)
-    return bool(stale)
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        if self._code is None:
+            signature = tuple(cast(Any, numba).typeof(argument) for argument in arguments)
+            self._kernel.compile(signature)
+            self._code = self._kernel.overloads[signature].entry_point
+        return self._code(*arguments)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make it again by the function's name, for `copy` and `pickle`."""
+        function = self._kernel.py_func
+        return _typed_kernel, (function.__module__, function.__name__)
 
 
-delete_stale_cache()
+def _typed_kernel(module: str, name: str) -> TypedKernel:
+    return TypedKernel(getattr(import_module(module), name))

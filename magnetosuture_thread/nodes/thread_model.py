@@ -284,7 +284,7 @@ class ThreadHealth:
         }
         if estimate.problems:
             figures["last_refused_piece"] = estimate.problems[0]
-        return figures | {f"learned {each.name}": each for each in estimate.slow_parameters}
+        return figures
 
 
 class ThreadForecasts:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +22,10 @@ from magnetosuture_thread.geometry.barrier import (
 )
 from magnetosuture_thread.geometry.compiled import compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
-from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, wall_contact
+from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, WorkspaceData, find_contacts, wall_contact
+from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.thread.mechanics import RodProperties, chord_lengths
 
 
 @dataclass(frozen=True)
@@ -126,20 +130,97 @@ class _ContactBarrier(RowBarrier):
     def rows(self, positions: Points) -> BarrierRows:
         """Return a row for each near pair, node by node, at positions of shape (n + 1, d)."""
         contacts = self.workspace.near(positions)
-        return self.rows_of(contacts, contacts.distance)
-
-    def rows_of(self, contacts: Contacts, distance: NDArray[np.float64]) -> BarrierRows:
-        """Return the same rows from what is known to be near.
-
-        Args:
-            contacts: of the nodes.
-            distance: that the clearance is of, as of the segments beside a node, shape (k,).
-        """
         chosen = np.flatnonzero(contacts.nearest & ((contacts.obstacle == DISH_WALL) == (self.name == WALL)))
         signed, normal = contacts.distance[chosen], contacts.normal[chosen]
         node, obstacle = contacts.node[chosen][:, None], contacts.obstacle[chosen]
-        clearance = distance[chosen] - self.distance
-        return BarrierRows(self.name, node, obstacle, signed - self.distance, normal[:, None, :], clearance)
+        value = signed - self.distance
+        return BarrierRows(self.name, node, obstacle, value, normal[:, None, :], value)
+
+
+class SolidRows(NamedTuple):
+    """Rows of obstacles, then of the wall, that are written by `solid_rows`.
+
+    Attributes:
+        node: index of the node, shape (k,).
+        obstacle: index of the obstacle, `DISH_WALL` for the wall, shape (k,).
+        value: h of the node, shape (k,) [m].
+        clearance: the same of the node and the half segments beside it, shape (k,) [m].
+        normal: derivative of h by the node's position, shape (k, d).
+    """
+
+    node: NDArray[np.uint32]
+    obstacle: NDArray[np.int32]
+    value: NDArray[np.float64]
+    clearance: NDArray[np.float64]
+    normal: Points
+
+    @classmethod
+    def room(cls, count: int, dimension: int) -> SolidRows:
+        """Return arrays for a number of rows."""
+        value, clearance = np.empty((2, count))
+        return cls(
+            np.empty(count, np.uint32), np.empty(count, np.int32), value, clearance, np.empty((count, dimension))
+        )
+
+
+@compiled_uncounted
+def solid_rows(
+    points: Points, around: WorkspaceData, radius: float, contacts: Contacts, rows: SolidRows
+) -> tuple[int, int]:
+    """Write the row of each node and each obstacle that is near, then of each node and the wall.
+
+    Args:
+        points: nodes, shape (n + 1, d) [m].
+        around: obstacles and wall.
+        radius: of the thread [m].
+        contacts: memory.
+        rows: written; with as much room.
+
+    Returns:
+        The number of rows, and of those of obstacles; -1 and 0 when there is no room for all contacts.
+    """
+    found = find_contacts(points, around, contacts)
+    written, obstacles = 0, 0
+    for kind in range(2):
+        for c in range(found):
+            i, o = contacts.node[c], contacts.obstacle[c]
+            if contacts.nearest[c] and (o == DISH_WALL) == (kind == 1):
+                least = half_segment_distance(points, i, o, contacts.distance[c], around)
+                rows.node[written], rows.obstacle[written] = i, o
+                rows.value[written], rows.clearance[written] = contacts.distance[c] - radius, least - radius
+                for a in range(points.shape[1]):
+                    rows.normal[written, a] = contacts.normal[c, a]
+                written += 1
+        if kind == 0:
+            obstacles = written
+    return (written, obstacles) if found >= 0 else (-1, 0)
+
+
+@compiled_uncounted
+def segment_rows_of(
+    rod: RodProperties, points: Points, heading: Points, work: Points, rows: NDArray[np.float64]
+) -> None:
+    """Write value and clearance of the rows of connectivity, then of compression, and the chords they keep.
+
+    Args:
+        rod: the thread.
+        points: nodes, shape (n + 1, d) [m].
+        heading: unit vector along the needle, shape (d,).
+        work: memory, shape (n + 1, d).
+        rows: written, shape (5, n) [m^2], [m], [m^2], [m], [m].
+    """
+    chords = rows[4]
+    for i in range(len(points)):
+        for a in range(points.shape[1]):
+            work[i, a] = points[i, a] / rod.unit
+    chord_lengths(work, heading, rod.clamped, chords)
+    for i in range(len(chords)):
+        square = 0.0
+        for a in range(points.shape[1]):
+            square += (points[i + 1, a] - points[i, a]) ** 2
+        length, chords[i] = math.sqrt(square), chords[i] * rod.unit
+        rows[0, i], rows[1, i] = 0.5 * (rod.unit * rod.unit - square), rod.unit - length
+        rows[2, i], rows[3, i] = 0.5 * (square - chords[i] * chords[i]), length - chords[i]
 
 
 @dataclass(frozen=True)

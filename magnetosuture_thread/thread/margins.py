@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +64,18 @@ def friction_colour(friction: Friction) -> Colour:
     return others.get(friction.state, (0.5, 0.5, 0.5))
 
 
+@lru_cache(maxsize=256)
+def constant_column(value: float, count: int, kind: str = "f8") -> NDArray[Any]:
+    """Return a column of one value, shared and read-only."""
+    column = np.full(count, value, kind)
+    column.flags.writeable = False
+    return column
+
+
+def _nothing() -> NDArray[np.float64]:
+    return constant_column(0.0, 0)
+
+
 @dataclass(frozen=True, eq=False)
 class BarrierMargins:
     """The margins of one barrier, an entry for each of its rows.
@@ -76,6 +90,7 @@ class BarrierMargins:
             half segments beside it, so that the least is that of the whole thread.
         bound: the clearance is greater than this with a probability of 99 %, shape (m,) [m]; -inf where the thread's
             covariance is not known.
+        normal: of an obstacle and the wall, derivative of the value by the node's position, shape (m, d); else empty.
     """
 
     barrier: str
@@ -83,12 +98,19 @@ class BarrierMargins:
     obstacle: NDArray[np.int32]
     value: NDArray[np.float64]
     clearance: NDArray[np.float64]
-    bound: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    bound: NDArray[np.float64] = field(default_factory=_nothing)
+    normal: NDArray[np.float64] = field(default_factory=_nothing)
 
     def __post_init__(self) -> None:
         """Take no bound as one that is not known."""
-        if not len(self.bound):
-            object.__setattr__(self, "bound", np.full(len(self.clearance), -np.inf))
+        if len(self.bound) != len(self.clearance):
+            object.__setattr__(self, "bound", constant_column(-math.inf, len(self.clearance)))
+
+    @classmethod
+    def from_rows(cls, rows: BarrierRows) -> BarrierMargins:
+        """Return the margins of the rows of any barrier."""
+        nodes, obstacle = rows.nodes[:, -1].astype(np.uint32), rows.obstacle.astype(np.int32)
+        return cls(rows.name, nodes, obstacle, rows.value, rows.clearance)
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -164,43 +186,29 @@ class Margins(Mapping[str, BarrierMargins]):
     @classmethod
     def of(
         cls,
-        barriers: Sequence[BarrierRows],
+        barriers: Sequence[BarrierMargins],
         contact_tolerance: float,
         scene_version: str = "",
     ) -> Margins:
         """Return the margins of barriers at the same positions.
 
         Args:
-            barriers: the rows of each, in SI units.
+            barriers: the margins of each, in SI units.
             contact_tolerance: a node touches a shape or the wall to which it, or half a segment beside it, is this
                 close [m].
             scene_version: of the scene.
         """
-        margins = tuple(
-            BarrierMargins(
-                rows.name,
-                rows.nodes[:, -1].astype(np.uint32),
-                rows.obstacle.astype(np.int32),
-                rows.value,
-                rows.clearance,
-            )
-            for rows in barriers
-        )
-        near = [m.node[m.clearance <= contact_tolerance] for m in margins if m.barrier in SOLID]
-        touching = sorted({node for nodes in near for node in nodes.tolist()})
-        return cls(margins, tuple(touching), scene_version=scene_version)
+        solids = (margins for margins in barriers if len(margins) and margins.barrier in SOLID)
+        near = [margins.node[margins.clearance <= contact_tolerance].tolist() for margins in solids]
+        in_contact = tuple(sorted(set().union(*near))) if near else ()
+        return cls(tuple(barriers), in_contact, scene_version=scene_version)
 
 
 def _row(margins: BarrierMargins, row: int) -> BarrierMargins:
     part = slice(row, row + 1)
-    return BarrierMargins(
-        margins.barrier,
-        margins.node[part],
-        margins.obstacle[part],
-        margins.value[part],
-        margins.clearance[part],
-        np.array([margins.bound.min(initial=math.inf)]),
-    )
+    value, clearance = margins.value[part], margins.clearance[part]
+    least = np.array([margins.bound.min(initial=math.inf)])
+    return BarrierMargins(margins.barrier, margins.node[part], margins.obstacle[part], value, clearance, least)
 
 
 def node_clearance(margins: Margins, count: int) -> NDArray[np.float64]:

@@ -164,7 +164,11 @@ class Thread:
     rest_curvature: float | tuple[float, ...] = 0.0
 
     def __post_init__(self) -> None:
-        """Check the curvatures' number."""
+        """Check the curvatures' number, and that something resists every motion."""
+        medium = self.medium
+        if not max(medium.mass_per_length, min(medium.drag_along, medium.drag_across)) > 0.0:
+            expected = "drag above 0 Pa s along and across, or a mass: nothing else resists a motion"
+            raise ConfigurationError("thread.medium", f"drag {medium.drag_along}, {medium.drag_across} Pa s", expected)
         if isinstance(self.rest_curvature, tuple) and len(self.rest_curvature) != self.segments - 1:
             expected = f"one number, or {self.segments - 1} of the inner nodes [1/m]"
             raise ConfigurationError("thread.rest_curvature", self.rest_curvature, expected)

@@ -38,6 +38,7 @@ from magnetosuture_thread.thread.barriers import (
     squared_barrier,
 )
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
+from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.program import SPAN, Mask, Solver, first_rows
 from magnetosuture_thread.thread.step import (
@@ -47,6 +48,8 @@ from magnetosuture_thread.thread.step import (
     StepResult,
     ThreadState,
 )
+
+MAX_ELONGATION = 1.5  # of the thread; slacks that give way by more hold nothing together, whatever the residuals say
 
 
 class PaperOptions(NamedTuple):
@@ -118,7 +121,7 @@ class PaperFormulation(Formulation):
         contacts, before_depth = self._write_obstacles(start, known, options.gain)
         added: AddedRows | None = None
         if self.added:
-            self.added.begin(state.positions, drive.time, interval)
+            self.added.begin(state.positions, drive, interval)
             added = self.added.linearised(start, moved, known, interval)
         solution = self._solve(first_rows(buffers, known, self._rows + contacts), velocities, added)
         rows = self._rows + contacts
@@ -131,8 +134,11 @@ class PaperFormulation(Formulation):
         near = self.workspace.near(after.positions)
         depth = max(0.0, self._radius - float(near.distance[~known[near.node]].min(initial=self._radius)))
         allowed = (1.0 - options.gain * interval) * before_depth + DEPTH_TOLERANCE
-        converged, status = depth <= allowed, solution.status
-        if not converged:
+        longest = float(np.sqrt(np.square(np.diff(end, axis=0)).sum(axis=1)).mean())
+        status, converged = solution.status, depth <= allowed and longest <= MAX_ELONGATION
+        if longest > MAX_ELONGATION:
+            status = f"not converged, the thread is {longest:.2f} times as long as it is; {status}"
+        elif not converged:
             status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
         return StepResult(after, solution.solver, status, solution.residuals, 1, converged)
 
@@ -169,10 +175,11 @@ class PaperFormulation(Formulation):
                 buffers.lower[row] = -gain * squared_barrier(signed, radius / unit) / signed
         return contacts, depth
 
-    def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
+    def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
         """Return connectivities and stiffness; see `Formulation`. There is none of compression in this formulation.
 
         Connectivity may give way, as the paper's has slack; what is left of it is what the margins say.
         """
         unit = self._thread.segment_length
-        return [Connectivity(unit), EnhancedConnectivity(unit), Stiffness(unit * self._rest)]
+        barriers = Connectivity(unit), EnhancedConnectivity(unit), Stiffness(unit * self._rest)
+        return [BarrierMargins.from_rows(barrier.rows(positions)) for barrier in barriers]

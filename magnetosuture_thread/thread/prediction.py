@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
+from magnetosuture_thread.geometry.arrays import as_numbers
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import InvalidInputError
@@ -54,7 +54,10 @@ class NeedlePose:
     motion: NeedleMotion | None = None
 
     def __post_init__(self) -> None:
-        """Take sequences of numbers as arrays."""
+        """Take sequences of numbers as arrays, and numbers of other types as floats."""
+        stamp: Any = self.stamp
+        if isinstance(stamp, np.number):
+            object.__setattr__(self, "stamp", float(stamp))
         for name in ("tail", "heading"):
             object.__setattr__(self, name, as_numbers(f"needle pose {name}", getattr(self, name)))
 
@@ -107,6 +110,11 @@ class Prediction:
         """
         return self.compute_forces()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything computed, for `copy` and `pickle`: what computes it belongs to the predictor."""
+        margins, forces = self.margins, self.forces
+        return {**self.__dict__, "compute_margins": None, "compute_forces": None, "margins": margins, "forces": forces}
+
     @property
     def tension(self) -> NDArray[np.float64] | None:
         """Tension of each segment, shape (n,) [N]; None where there are no `forces`."""
@@ -134,6 +142,7 @@ def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int =
     if not math.hypot(*tail) <= reach:
         expected = f"finite coordinates, at most {reach:g} m from the dish's centre"
         raise InvalidInputError("needle pose position", tail, expected + Quantity("", "m", -reach, reach).hint(tail))
-    finite_array("needle pose deviation", pose.deviation, (2,), DEVIATION)
+    if not (len(pose.deviation) == 2 and all(0.0 <= deviation < math.inf for deviation in pose.deviation)):
+        raise InvalidInputError("needle pose deviation", pose.deviation, "two finite numbers, not negative")
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")

@@ -20,7 +20,7 @@ from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.thread.forces import ThreadForces
-from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
@@ -81,6 +81,13 @@ class PredictorOptions:
     residual_tolerance: Annotated[float, bounded("", 1e-15, 1e-2)] = 1e-6
     max_step: Annotated[float, bounded("s", 1e-5, 2.0)] = 0.02
     max_substeps: Annotated[int, bounded("", 1, 100_000)] = 200
+
+    def substeps(self, interval: float, way: float) -> int:
+        """Return into how many steps an interval [s] is divided in which the fastest node goes a way [segments]."""
+        if interval <= self.max_step and way <= MAX_STEP_LENGTH:
+            return 1
+        wanted = max(interval / self.max_step, way / MAX_STEP_LENGTH, 1.0)
+        return min(self.max_substeps, math.ceil(wanted - 1e-9))
 
 
 class ThreadPredictor:
@@ -320,15 +327,14 @@ class ThreadPredictor:
             _check_node("node of prescribed motion", node, self.thread)
             ends[node] = finite_array(f"position of node {node}", position, self._shape[1:], self._limits)
         nodes = tuple(ends)
-        begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
+        begin, end = state.positions[list(nodes)], np.array(list(ends.values()))
         way = max(map(math.dist, begin.tolist(), end.tolist()))
-        wanted = max(interval / self.options.max_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
-        substeps = min(self.options.max_substeps, math.ceil(wanted - 1e-9))
+        substeps = self.options.substeps(interval, way / self.thread.segment_length)
 
         def drive(part: float) -> PrescribedMotion:
-            mixed = (1.0 - part) * last.heading + part * pose.heading
-            size = math.hypot(*mixed.tolist())  # 0 between opposite headings
-            heading = mixed / size if size > 1e-6 else pose.heading
+            heading = (1.0 - part) * last.heading + part * pose.heading
+            size = math.hypot(*heading.tolist())  # 0 between opposite headings
+            heading = heading / size if size > 1e-6 else pose.heading
             return PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval)
 
         results = list[StepResult]()
@@ -336,7 +342,8 @@ class ThreadPredictor:
             results += self._follow(state, drive, index / substeps, interval / substeps, interval)
             state = results[-1].state
         self.pose, self.state = pose, state
-        return self._prediction(pose, interval, results, dict(zip(nodes, (end - begin) / interval, strict=True)))
+        velocities = dict(zip(nodes, (end - begin) / interval, strict=True)) if pose.motion is not None else {}
+        return self._prediction(pose, interval, results, velocities)
 
     def _follow(
         self,
@@ -388,12 +395,12 @@ class ThreadPredictor:
         assert state is not None
         positions = state.positions
         warm_start = formulation.warm_start() if results and pose.motion is not None else None
-        self.added.set_time(pose.stamp)
-        added = self.added.rows(positions)  # at once, as barriers may move on before they are asked again
+        # At once, as barriers may move on before they are asked again.
+        added = [BarrierMargins.from_rows(rows) for rows in self.added.rows_at(pose.stamp, positions, pose.heading)]
 
         def compute_margins() -> Margins:
-            rows = formulation.margins(positions, pose.heading)
-            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
+            margins = formulation.margins(positions, pose.heading)
+            return Margins.of([*margins, *added], self.contact_tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
             found = formulation.forces(results[-1], pose.heading) if results else None
@@ -403,14 +410,12 @@ class ThreadPredictor:
 
         # The first that was not solved at once, if there is one, else the last.
         told = next((done for done in results if done.status != SOLVED), results[-1] if results else None)
-        along = positions[1:] - positions[:-1]
-        lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
             stamp=pose.stamp,
             formulation=formulation.name,
             scene_version=self.scene_version,
             positions=positions,
-            strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
+            strain=formulation.strain(positions, pose.heading),
             interval=interval,
             substeps=len(results),
             solver=told.solver if told else "none",

@@ -165,6 +165,7 @@ class RodBuffers(NamedTuple):
         internal: what the segments push each node with, shape (n + 1, d).
         contact_force: what contacts push each node with, with friction, shape (n + 1, d).
         tail_load: what medium and contacts do at the needle's tail, shape (d,).
+        end: positions [m] and velocities [m/s] at the end of the step, shape (2, n + 1, d).
     """
 
     program: StepBuffers
@@ -176,6 +177,7 @@ class RodBuffers(NamedTuple):
     internal: Points
     contact_force: Points
     tail_load: Vector
+    end: Table
 
     @classmethod
     def of(cls, program: StepBuffers, dimension: int) -> RodBuffers:
@@ -193,6 +195,7 @@ class RodBuffers(NamedTuple):
             internal,
             contact_force,
             np.zeros(dimension),
+            np.zeros((2, nodes, dimension)),
         )
 
     @property

@@ -30,17 +30,25 @@ a compliance of 1e-7 instead of slacks, and where the barriers are linearised is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.geometry.barrier import Barrier
-from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.barrier import COMPRESSION, CONNECTIVITY, NO_OBSTACLE, Barrier
+from magnetosuture_thread.geometry.compiled import (
+    TypedKernel,
+    compiled_inline,
+    compiled_inner,
+    compiled_uncounted,
+    compiled_uncounted_without_gil,
+    compiled_within,
+)
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread import banded, mechanics
-from magnetosuture_thread.thread.barriers import Compression, Connectivity, move_inside
+from magnetosuture_thread.thread.barriers import move_inside, segment_rows_of
 from magnetosuture_thread.thread.contact_rows import (
     DEPTH_TOLERANCE,
     contact_rows,
@@ -51,6 +59,7 @@ from magnetosuture_thread.thread.contact_rows import (
     stays_clear,
 )
 from magnetosuture_thread.thread.forces import ThreadForces, friction_of, keep_internal_forces, write_forces
+from magnetosuture_thread.thread.margins import BarrierMargins, constant_column
 from magnetosuture_thread.thread.material import Attachment, Thread
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.program import (
@@ -62,12 +71,14 @@ from magnetosuture_thread.thread.program import (
     SOLVED,
     START,
     VELOCITIES,
+    ChainProgram,
     Indices,
     Mask,
     Residuals,
     RodBuffers,
     Solver,
     StepBuffers,
+    Table,
     Vector,
     compiled_residuals,
     first_rows,
@@ -341,7 +352,7 @@ class StepProgress(NamedTuple):
     residuals: tuple[float, float, float]
 
 
-@compiled_uncounted
+@compiled_uncounted_without_gil
 def solve_step(
     model: StepModel,
     buffers: RodBuffers,
@@ -349,39 +360,39 @@ def solve_step(
     given: StepInput,
     solves: int,
     elsewhere: float,
-) -> StepProgress:
+) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
     """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
 
-    A solve whose residuals do not pass is repeated from a cold start. One that does not halve how far off the barriers
-    are is followed by one that is linearised halfway back.
+    A linearisation that does not halve how far off the barriers are is followed by one halfway back.
 
     Args:
         model: the thread and what is around it.
-        buffers: the step under way; it has the program in the end, and its multipliers.
+        buffers: the step under way; it has the program in the end, its multipliers, and the end of the step.
         solver_buffers: of the structured solver.
         given: the step.
         solves: how many this step has had; with none it begins.
         elsewhere: how far off the rows are that this code does not know, see `assemble_step`.
+
+    Returns:
+        The fields of `StepProgress`, which a named tuple would take as long to return as it takes to set up a step.
     """
-    workspace, about, last_about = model.workspace, buffers.motion[ABOUT], buffers.motion[LAST_ABOUT]
+    about, last_about = buffers.motion[ABOUT], buffers.motion[LAST_ABOUT]
     if solves == 0:
         init_step(buffers, given, model.rod.unit)
     copy_points(about, last_about)
     primal, dual, complementarity, segments = 0.0, 0.0, 0.0, len(about) - 1
     # Numbers of a type of their own: a function is compiled again for each number that is written out.
     first, unknown, status = np.int64(0), np.int64(-1), np.int64(banded.SOLVED)
-    last_off, contacts, code, u = np.inf, unknown, UNSOLVED, buffers.motion[VELOCITIES]
+    last_off, contacts, code = np.inf, unknown, UNSOLVED
     off, rubs, halved = np.inf, False, False
     while True:
         begun, before = (first, unknown) if halved else (solves, contacts)
-        contacts, found_off, found_rubs = assemble_step(begun, model, buffers, given, elsewhere, before)
+        contacts, assembled_off, assembled_rubs = assemble_step(begun, model, buffers, given, elsewhere, before)
         if not halved:
-            off, rubs = found_off, found_rubs
+            off, rubs = assembled_off, assembled_rubs
             if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
                 # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
-                for i in range(len(about)):
-                    for a in range(about.shape[1]):
-                        about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
+                halfway(about, last_about)
                 halved = True
                 continue
         halved = False
@@ -391,30 +402,57 @@ def solve_step(
             code = NO_ROOM
             break
         if (off <= 1.0 and not rubs) or solves == model.max_solves:
-            if off > 1.0:  # whatever else holds, nothing passes the wall
-                move_inside(about, buffers.known, (workspace.wall_radius - model.rod.radius) / model.rod.unit)
+            finish_step(model, buffers, given, off)
             code = ENDED
             break
         if not model.structured:
             break
         rows = segments + contacts
         program, multipliers = program_view(buffers.program, buffers.known, rows), buffers.program.multipliers[:rows]
-        word, _ = banded.solve(program, u, multipliers, solver_buffers)
-        found = compiled_residuals(program, u, multipliers)
-        if not max(found) <= model.tolerance:
-            u[:] = 0.0
-            multipliers[:] = 0.0
-            banded.solve(program, u, multipliers, solver_buffers)
-            found = compiled_residuals(program, u, multipliers)
-            if not max(found) <= model.tolerance:
-                u[:] = 0.0
-                multipliers[:] = 0.0
-                break
-            word = banded.RESTARTED
-        accept_step(buffers, workspace.friction, rows, given.interval)
-        primal, dual, complementarity = max(primal, found[0]), max(dual, found[1]), max(complementarity, found[2])
+        word, residuals = solve_checked(program, buffers.motion[VELOCITIES], multipliers, solver_buffers, model)
+        if not max(residuals) <= model.tolerance:
+            break
+        accept_step(buffers, model.workspace.friction, rows, given.interval)
+        primal, dual = max(primal, residuals[0]), max(dual, residuals[1])
+        complementarity = max(complementarity, residuals[2])
         status, solves = status if status != 0 else word, solves + 1
-    return StepProgress(code, contacts, solves, off, status, (primal, dual, complementarity))
+    return code, contacts, solves, off, status, (primal, dual, complementarity)
+
+
+@compiled_inline
+def halfway(points: Points, last: Points) -> None:
+    """Move points halfway back to where they were last."""
+    for i in range(len(points)):
+        for a in range(points.shape[1]):
+            points[i, a] = 0.5 * (points[i, a] + last[i, a])
+
+
+@compiled_within
+def solve_checked(
+    program: ChainProgram, u: Points, multipliers: Vector, solver_buffers: banded.SolverBuffers, model: StepModel
+) -> tuple[int, tuple[float, float, float]]:
+    """Solve a program; where the residuals do not pass, again from a cold start. Return status and residuals."""
+    word, residuals = np.int64(banded.SOLVED), (np.inf, np.inf, np.inf)
+    for attempt in range(2):
+        word, _ = banded.solve(program, u, multipliers, solver_buffers)
+        residuals = compiled_residuals(program, u, multipliers)
+        if max(residuals) <= model.tolerance:
+            return word if attempt == 0 else np.int64(banded.RESTARTED), residuals
+        u[:] = 0.0
+        multipliers[:] = 0.0
+    return word, residuals
+
+
+@compiled_within
+def finish_step(model: StepModel, buffers: RodBuffers, given: StepInput, off: float) -> None:
+    """Write where the step ends, and the velocities over it; whatever else holds, nothing passes the wall."""
+    about, before, unit, end = buffers.motion[ABOUT], buffers.motion[BEFORE], model.rod.unit, buffers.end
+    if off > 1.0:
+        move_inside(about, buffers.known, (model.workspace.wall_radius - model.rod.radius) / unit)
+    for i in range(len(about)):
+        for a in range(about.shape[1]):
+            end[0, i, a] = about[i, a] * unit
+            end[1, i, a] = (about[i, a] - before[i, a]) * (unit / given.interval)
 
 
 @compiled_uncounted
@@ -440,6 +478,8 @@ class RodFormulation(Formulation):
 
     Attributes:
         rod: the thread, for compiled code.
+        step_model: the thread and what is around it, for compiled code.
+        buffers: of the last step.
     """
 
     name = "rod"
@@ -454,18 +494,37 @@ class RodFormulation(Formulation):
         barriers: Sequence[Barrier] = (),
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
-        self._buffers = RodBuffers.of(self._program, self.dimension)
-        self._bands = mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED)
-        self.rod = self.rod_of(thread)
+        self.buffers = RodBuffers.of(self._program, self.dimension)
+        medium = thread.medium
+        self.rod = RodProperties(
+            thread.attachment is Attachment.CLAMPED,
+            float(thread.segment_length),
+            float(self._radius),
+            float(thread.bending_stiffness),
+            float(medium.drag_across),
+            float(medium.drag_along),
+            float(medium.mass_per_length),
+            float(medium.bending_damping),
+            self._vector("gravity", medium.gravity),
+            np.ascontiguousarray(thread.rest_angles),
+            mechanics.end_corrected_weights(thread.segments),
+            mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED),
+            self._vector("flow", medium.flow),
+        )
         first = solver.first if type(solver) is FallbackSolver else solver
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
         self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._program.first))
+        self._solve_step, self._force_kernel = TypedKernel(solve_step), TypedKernel(write_forces)
+        self._segment_kernel = TypedKernel(segment_rows_of)
+        self._last_nodes = np.arange(1, self._rows + 1, dtype=np.uint32)
+        self._last_nodes.flags.writeable = False
         selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
         self._self_contact = selves[0] if selves else None
         self.touches_itself = bool(selves)
         self._only_self_contact = len(barriers) == len(selves)
         self._rough = knows_friction(self.workspace.data.friction)
+        self.step_model = StepModel(self.rod, self.workspace.data, float(tolerance), MAX_SOLVES, self._structured)
 
     @property
     def nodes_in_contact(self) -> Mask:
@@ -476,45 +535,18 @@ class RodFormulation(Formulation):
         return np.asarray(at_nodes)
 
     def _memory(self) -> WarmStart:
-        return self._buffers.memory
+        return self.buffers.memory
 
     def forget(self) -> None:
         """Forget the last solve; see `Formulation`."""
         super().forget()
-        self._buffers.grips.shape[:], self._buffers.grips.force[:] = NO_SHAPE, 0.0
-
-    def set_thread(self, thread: Thread) -> None:
-        """Change stiffness, rest curvature and medium from the next step on; the chain itself stays as it is.
-
-        Args:
-            thread: of the same length, segments, diameter and attachment.
-        """
-        self._thread, self.rod = thread, self.rod_of(thread)
-
-    def rod_of(self, thread: Thread) -> RodProperties:
-        """Return a thread that differs in stiffness, rest curvature and medium, for compiled code."""
-        medium = thread.medium
-        return RodProperties(
-            thread.attachment is Attachment.CLAMPED,
-            thread.segment_length,
-            self._radius,
-            thread.bending_stiffness,
-            medium.drag_across,
-            medium.drag_along,
-            medium.mass_per_length,
-            medium.bending_damping,
-            self._vector("gravity", medium.gravity),
-            np.ascontiguousarray(thread.rest_angles),
-            mechanics.end_corrected_weights(thread.segments),
-            self._bands,
-            self._vector("flow", medium.flow),
-        )
+        self.buffers.grips.shape[:], self.buffers.grips.force[:] = NO_SHAPE, 0.0
 
     def _vector(self, name: str, values: tuple[float, ...]) -> Vector:
         """Return a vector of the medium, zeros where it has none."""
         if len(values) not in (0, self.dimension):
             raise ConfigurationError(f"medium.{name}", values, f"{self.dimension} values, or none")
-        return np.array(values) if values else np.zeros(self.dimension)
+        return np.array(values, np.float64) if values else np.zeros(self.dimension)
 
     def check_start(self, positions: Points) -> None:
         """Refuse a thread that crosses itself where it cannot; see `Formulation`."""
@@ -530,23 +562,23 @@ class RodFormulation(Formulation):
         Compiled code takes the step as long as the structured solver gets on with it. The rows of added barriers are
         in the program from where it ends without them and one is not met.
         """
-        unit, buffers = self._thread.segment_length, self._buffers
+        buffers = self.buffers
         if state.interval == 0.0:
             self.forget()
-        # Compiled code would be compiled anew for another layout, in the middle of a run.
+        # Compiled code takes contiguous arrays.
         positions = np.ascontiguousarray(state.positions, np.float64)
         velocities = np.ascontiguousarray(state.velocities, np.float64)
-        given = StepInput(positions, velocities, *drive.arrays(), drive.heading, interval, state.interval)
-        model = self.step_model()._replace(structured=self._structured)
+        given = StepInput(positions, velocities, *drive.arrays(), float(interval), float(state.interval))
+        model = self.step_model
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         added: AddedRows | None = None
         off = 0.0  # how far the added rows are from being met
         before = None
         if self.added:
-            self.added.begin(positions, drive.time, interval)
+            self.added.begin(positions, drive, interval)
             before = self.warm_start()
         while True:
-            done = solve_step(model, buffers, self._solver_buffers, given, solves, off)
+            done = self.solve(given, solves, off, model)
             worst, solves = _worse(worst, done.residuals), done.solves
             status = status if status != SOLVED else banded.STATUS[done.status]
             if done.code == NO_ROOM:
@@ -577,60 +609,107 @@ class RodFormulation(Formulation):
             worst, solves = _worse(worst, solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
-        about, before_step = buffers.motion[ABOUT], buffers.motion[BEFORE]
-        end = ThreadState(about * unit, (about - before_step) * (unit / interval), interval)
+        end, velocity = buffers.end.copy()
+        after = ThreadState(end, velocity, interval)
         if done.off > 1.0:
             words = f"not converged in {solves} linearisations, off by {done.off:.1g} times what is allowed"
             status = f"{words}; {status}"
         loads = buffers.internal.copy(), buffers.contact_force.copy(), buffers.tail_load.copy()
         grip, own_way = buffers.grips.force.copy() if self._rough else None, self._self_contact
-        passed = done.off > 1.0 and own_way is not None and own_way.passed(positions, end.positions)
-        return StepResult(end, solver, status, worst, solves, done.off <= 1.0, loads, grip, passed)
+        passed = done.off > 1.0 and own_way is not None and own_way.passed(positions, end)
+        return StepResult(after, solver, status, worst, solves, done.off <= 1.0, loads, grip, passed)
 
-    def new_buffers(self) -> RodBuffers:
-        """Return memory for the steps of another thread like this one."""
-        return RodBuffers.of(StepBuffers.of(self._rows + 1, self.dimension, self._rows), self.dimension)
+    def solve(
+        self, step_input: StepInput, solves: int = 0, elsewhere: float = 0.0, model: StepModel | None = None
+    ) -> StepProgress:
+        """Let compiled code take a step as far as it gets; see `solve_step`. Arrays have to be contiguous."""
+        model = self.step_model if model is None else model
+        arguments = model, self.buffers, self._solver_buffers, step_input, solves, elsewhere
+        return StepProgress(*self._solve_step(*arguments))
 
-    def step_model(self) -> StepModel:
-        """Return the thread and what is around it, for compiled code."""
-        return StepModel(self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
+    def separate(self) -> RodFormulation:
+        """Return the same formulation with buffers of its own, for the steps of another thread like this one."""
+        other, dimension = copy(self), self.dimension
+        other._program = StepBuffers.of(self._rows + 1, dimension, self._rows)
+        other.buffers = RodBuffers.of(other._program, dimension)
+        other._solver_buffers = BandedSolver().buffers(self._rows + 1, dimension, len(self._program.first))
+        return other
 
     def _linearised(self, interval: float) -> AddedRows:
-        motion = self._buffers.motion
-        return self.added.linearised(motion[ABOUT], motion[START], self._buffers.known, interval)
+        motion = self.buffers.motion
+        return self.added.linearised(motion[ABOUT], motion[START], self.buffers.known, interval)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
         assert result.loads is not None
-        rod, state, (internal, contact, load) = self.rod, result.state, result.loads
-        scale = (rod.drag_across + rod.mass_per_length / state.interval) * rod.unit**2
-        tension, force = np.empty(len(internal) - 1), np.empty(self.dimension)
-        positions, velocities = state.positions / rod.unit, state.velocities
-        moment = write_forces(rod, positions, velocities, heading, internal, load, scale, tension, force)
-        friction, use = np.zeros(len(positions)), np.zeros(len(positions))
+        state, (internal, contact, load) = result.state, result.loads
+        tension, force = np.empty(self._rows), np.empty(self.dimension)
+        moved = state.positions / self.rod.unit, state.velocities, state.interval
+        moment, scale = self.write_forces(*moved, heading, (internal, load), tension, force)
+        friction, use = np.zeros((2, self._rows + 1))
         if result.grip is not None:
             friction, use = friction_of(result.grip)
             friction *= scale
         return ThreadForces(tension, scale * contact, force, moment, friction, use)
+
+    def write_forces(
+        self,
+        positions: Points,
+        velocities: Points,
+        interval: float,
+        heading: Points,
+        loads: tuple[Points, Vector],
+        tension: Vector,
+        force: Vector,
+    ) -> tuple[float, float]:
+        """Write tension and force at the end of a step; see `write_forces`. Arrays have to be contiguous.
+
+        Args:
+            positions: of all nodes, shape (n + 1, d) [D].
+            velocities: over the step [m/s].
+            interval: of the step [s].
+            heading: of the needle, shape (d,).
+            loads: `internal` and `tail_load` of the buffers.
+            tension: written, shape (n,) [N].
+            force: upon the needle, written, shape (d,) [N].
+
+        Returns:
+            The moment [N m], and the force of a unit of the loads [N].
+        """
+        rod = self.rod
+        scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
+        along = np.ascontiguousarray(heading)
+        arguments = rod, positions, velocities, along, *loads, scale, tension, force
+        return self._force_kernel(*arguments), scale
 
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
         super().warm_up()
         nodes, heading = self._thread.segments + 1, np.eye(self.dimension)[0]
         still, chain = np.zeros((nodes, self.dimension)), np.outer(np.arange(nodes), heading)
-        accept_step(self._buffers, self.workspace.data.friction, self._rows, 1.0)
+        accept_step(self.buffers, self.workspace.data.friction, self._rows, 1.0)
         tension, force = np.zeros(self._rows), np.zeros(self.dimension)
-        write_forces(self.rod, chain, still, heading, still, force, 1.0, tension, force)
+        self.write_forces(chain, still, 1.0, heading, (still, force), tension, force)
 
-    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
-        """Return the chords of the segments' arcs; see `Formulation`."""
-        chords = np.empty(self._thread.segments)
-        mechanics.chord_lengths(positions / self._thread.segment_length, heading, self.rod.clamped, chords)
-        return chords * self._thread.segment_length
+    def strain(self, positions: Points, heading: Points) -> Vector:
+        """Return each segment's length over the chord of its arc, less one; see `Formulation`."""
+        rows = self._segment_rows(positions, heading)
+        return np.asarray(rows[3] / rows[4])
 
-    def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
+    def _segment_rows(self, positions: Points, heading: Points) -> Table:
+        """Return value and clearance of connectivity and of compression, and the chords; see `segment_rows_of`."""
+        points, rows = np.ascontiguousarray(positions), np.empty((5, self._rows))
+        self._segment_kernel(self.rod, points, np.ascontiguousarray(heading), np.empty(points.shape), rows)
+        return rows
+
+    def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
         """Return connectivity and compression; see `Formulation`."""
-        return [Connectivity(self._thread.segment_length), Compression(self.rest_lengths(positions, heading))]
+        rows = self._segment_rows(positions, heading)
+        column = constant_column(NO_OBSTACLE, self._rows, "i4")
+        return [
+            BarrierMargins(CONNECTIVITY, self._last_nodes, column, rows[0], rows[1]),
+            BarrierMargins(COMPRESSION, self._last_nodes, column, rows[2], rows[3]),
+        ]
 
 
 def _worse(one: tuple[float, float, float], other: tuple[float, float, float]) -> Residuals:

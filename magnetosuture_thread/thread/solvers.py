@@ -42,6 +42,13 @@ class QuadraticProgram:
     upper: Vector
     unknown: NDArray[np.intp]
 
+    def check(self) -> None:
+        """Raise `ValueError` where a number is not finite or bounds cross."""
+        if not all(np.isfinite(values).all() for values in (self.P.data, self.q, self.A.data)):
+            raise ValueError("a number that is not finite")
+        if not (self.lower <= self.upper).all():
+            raise ValueError("a lower bound above the upper one")
+
 
 def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
     """Write a chain's program with sparse matrices, its known nodes taken out and its slacks as variables.
@@ -109,9 +116,6 @@ class OsqpSolver:
     name = "osqp"
 
     def __init__(self, tolerance: float = 1e-7, iterations: int = 20_000) -> None:
-        import osqp  # here, as it brings a library for pages that most processes do not need
-
-        self._osqp = osqp
         self._settings: dict[str, Any] = {
             "eps_abs": tolerance,
             "eps_rel": tolerance,
@@ -124,12 +128,15 @@ class OsqpSolver:
 
     def solve(self, program: ChainProgram, velocities: Points, multipliers: Vector) -> Solution:
         """Solve one program; see `Solver`."""
+        import osqp  # here, as it brings a library for pages that most processes do not need
+
         general = as_quadratic_program(program)
         flat, found_multipliers = np.full(program.linear.size, np.nan), np.full(len(program.lower), np.nan)
         try:
+            general.check()  # OSQP prints what is wrong, and cannot be kept from it
             self._load(general)
             found = self._solver.solve(raise_error=False)
-        except self._osqp.OSQPException as error:
+        except (ValueError, osqp.OSQPException) as error:
             self._loaded, status, iterations = None, f"refused: {error}", 0
         else:
             status, iterations = str(found.info.status), int(found.info.iter)
@@ -143,12 +150,18 @@ class OsqpSolver:
         residuals = residuals_of(program, u, found_multipliers)
         return Solution(u, found_multipliers, self.name, status, iterations, residuals)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything but what OSQP keeps of the last program, which is set up again."""
+        return {**self.__dict__, "_solver": None, "_loaded": None}
+
     def _load(self, program: QuadraticProgram) -> None:
+        import osqp
+
         last = self._loaded
         if last is not None and _same_pattern(last.P, program.P) and _same_pattern(last.A, program.A):
             self._solver.update(Px=program.P.data, Ax=program.A.data, q=program.q, l=program.lower, u=program.upper)
         else:
-            self._solver = self._osqp.OSQP()
+            self._solver = osqp.OSQP()
             self._solver.setup(program.P, program.q, program.A, program.lower, program.upper, **self._settings)
         self._loaded = program
 

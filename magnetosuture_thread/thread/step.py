@@ -11,12 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.barrier import Barrier, BarrierRows
-from magnetosuture_thread.geometry.obstacles import Workspace, half_segment_distances
+from magnetosuture_thread.geometry.barrier import OBSTACLE, WALL, Barrier, BarrierRows
+from magnetosuture_thread.geometry.compiled import TypedKernel
+from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.settings.errors import SolverError
-from magnetosuture_thread.thread.barriers import ObstacleAvoidance, WallAvoidance
+from magnetosuture_thread.thread.barriers import SolidRows, solid_rows
 from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.program import (
     ChainProgram,
@@ -33,6 +35,7 @@ from magnetosuture_thread.thread.program import (
 )
 
 DISTANCE_TOLERANCE = 1e-7  # m; an added row that is met but for this much of its nodes' way holds
+MARGINS_PER_NODE = 16  # for which there is room at first
 UNMET_COMPLIANCE = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
 
 
@@ -89,10 +92,10 @@ class PrescribedMotion:
     heading: Points
     time: float = 0.0
 
-    def arrays(self) -> tuple[Indices, Points]:
-        """Return the nodes and where they are at the end, for compiled code."""
+    def arrays(self) -> tuple[Indices, Points, Points]:
+        """Return the nodes, where they are at the end, and the heading, for compiled code."""
         ends = np.ascontiguousarray(self.positions, dtype=np.float64).reshape(len(self.nodes), len(self.heading))
-        return np.array(self.nodes, dtype=np.int64), ends
+        return np.array(self.nodes, dtype=np.int64), ends, np.ascontiguousarray(self.heading, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -181,35 +184,38 @@ class AddedBarriers:
         self._barriers, self._unit = tuple(barriers), segment_length
         self._before: list[Vector | None] = [None] * len(self._barriers)
         self._start = np.empty((0, 0))
+        self._heading: Points | None = None
         self.first_time = math.inf
 
     def __bool__(self) -> bool:
         """Return whether there are any."""
         return bool(self._barriers)
 
-    def rows(self, positions: Points) -> list[BarrierRows]:
-        """Return the rows of each barrier at positions of shape (n + 1, d) [m]."""
+    def rows_at(self, stamp: float, positions: Points, heading: Points) -> list[BarrierRows]:
+        """Return the rows of each barrier at a stamp [s], positions of shape (n + 1, d) [m] and a heading."""
+        self.move_to(stamp, positions[0], heading)
         return [barrier.rows(positions) for barrier in self._barriers]
 
-    def set_time(self, time: float) -> None:
-        """Set the time of the next evaluation, a stamp [s]."""
+    def move_to(self, stamp: float, tail: Points, heading: Points) -> None:
+        """Set the stamp of the next evaluation [s], and the needle: where the thread is fixed [m], and its heading."""
+        self._heading = heading
         for barrier in self._barriers:
-            barrier.move_to(time, self.first_time)
+            barrier.move_to(stamp, self.first_time, (tail, heading))
 
-    def begin(self, positions: Points, time: float, interval: float) -> None:
+    def begin(self, positions: Points, drive: PrescribedMotion, interval: float) -> None:
         """Begin a step: keep h(x) of the barriers whose gain does not let it fall to 0 within it.
 
         Args:
             positions: of all nodes before the step, shape (n + 1, d) [m].
-            time: at the end of the step [s].
+            drive: the needle at the end of the step.
             interval: dt [s].
         """
-        self._start = positions
-        self.set_time(time - interval)
+        self._start, before = positions, drive.heading if self._heading is None else self._heading
+        self.move_to(drive.time - interval, positions[0], before)
         for index, barrier in enumerate(self._barriers):
             slow = barrier.gain * interval < 1.0
             self._before[index] = np.asarray(barrier.value(positions), dtype=np.float64) if slow else None
-        self.set_time(time)
+        self.move_to(drive.time, drive.positions[0], drive.heading)
 
     def linearised(self, about: Points, start: Points, known: Mask, interval: float) -> AddedRows:
         """Return the rows of all barriers about a predicted end point.
@@ -295,6 +301,8 @@ class Formulation(ABC):
         friction = (workspace.friction, workspace.wall_friction) if self.has_friction else ((), 0.0)
         self.workspace = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)
+        self._contacts = Contacts.room(MARGINS_PER_NODE * nodes, self.dimension)  # memory of margins
+        self._solid_rows = TypedKernel(solid_rows)
         self._rows, self._program = rows, StepBuffers.of(nodes, self.dimension, rows)
 
     @abstractmethod
@@ -338,9 +346,10 @@ class Formulation(ABC):
             InvalidInputError: it is such a one.
         """
 
-    def rest_lengths(self, positions: Points, heading: Points) -> Vector:
-        """Return how long each segment should be, from end to end, at these positions [m], shape (n,)."""
-        return np.full(self._thread.segments, self._thread.segment_length)
+    def strain(self, positions: Points, heading: Points) -> Vector:
+        """Return each segment's length over what it should be from end to end, less one, shape (n,)."""
+        along = positions[1:] - positions[:-1]
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", along, along)) / self._thread.segment_length - 1.0)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces | None:
         """Return the forces at the end of a step, None where the formulation is of no mechanics.
@@ -352,18 +361,29 @@ class Formulation(ABC):
         return None
 
     @abstractmethod
-    def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
-        """Return the built-in barriers of the thread itself, obstacles and wall aside, at these positions."""
+    def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
+        """Return the margins of the built-in barriers of the thread itself, obstacles and wall aside."""
 
-    def margins(self, positions: Points, heading: Points) -> list[BarrierRows]:
-        """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
-        around = self._margin_workspace
-        contacts = around.near(positions)
-        distance = half_segment_distances(np.ascontiguousarray(positions), around.data, contacts)
+    def margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
+        """Return the margins of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
+        return [*self.segment_margins(positions, heading), *self.solid_margins(positions)]
+
+    def solid_margins(self, positions: Points) -> list[BarrierMargins]:
+        """Return the margins of obstacles and wall at positions of shape (n + 1, d) [m].
+
+        The clearance is that of the node and the half segments beside it.
+        """
+        points, count, obstacles = np.ascontiguousarray(positions), -1, 0
+        while count < 0:
+            rows = SolidRows.room(len(self._contacts.node), self.dimension)
+            known = points, self._margin_workspace.data, self._radius, self._contacts
+            count, obstacles = self._solid_rows(*known, rows)
+            if count < 0:  # in a scene of many shapes a node may be near all of them
+                self._contacts = Contacts.room(4 * len(self._contacts.node), self.dimension)
+        node, obstacle, value, clearance, normal = (column[:count].copy() for column in rows)
         return [
-            *(barrier.rows(positions) for barrier in self.segment_barriers(positions, heading)),
-            ObstacleAvoidance(around, self._radius).rows_of(contacts, distance),
-            WallAvoidance(around, self._radius).rows_of(contacts, distance),
+            BarrierMargins(name, node[part], obstacle[part], value[part], clearance[part], normal=normal[part])
+            for name, part in ((OBSTACLE, slice(obstacles)), (WALL, slice(obstacles, None)))
         ]
 
     def _solve(self, program: ChainProgram, velocities: Points, added: AddedRows | None) -> Solution:

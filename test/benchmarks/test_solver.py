@@ -18,12 +18,13 @@ def test_rows_have_every_field_and_small_residuals():
     parts: list[float] = []
     rows = measure((12,), 12, 0.05, False, parts.append)
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
-    names = ("rod step, banded", "rod solve, banded", "rod step, osqp", "rod solve, osqp")
-    found = {(row["system"], row["n"], row["d"], row["obstacles"]) for row in rows}
-    assert found == {(name, 12, d, obstacles) for name in names for d in (2, 3) for obstacles in (0, 3)}
+    names = {f"rod {part}, {name}" for part in ("step", "solve") for name in ("banded", "osqp")}
+    names.add("predictor step with margins")
+    systems = {(row["system"], row["n"], row["d"], row["obstacles"]) for row in rows}
+    assert systems == {(name, 12, d, obstacles) for name in names for d in (2, 3) for obstacles in (0, 3)}
     for row in rows:
         assert 0.0 < row["median_s"] <= row["p99_s"]
-        assert row["max_residual"] < (1e-6 if row["system"].endswith("banded") else 1e-4)
+        assert row["max_residual"] < (1e-4 if row["system"].endswith("osqp") else 1e-6)
     assert (parts[0], parts[-1]) == (0.0, 1.0)
     assert parts == sorted(parts)
 
@@ -51,6 +52,7 @@ def test_motion_is_of_the_speed_and_the_thread_of_the_length_that_it_should_be(d
     chords = np.linalg.norm(np.diff(motion.start, axis=0), axis=1)
     assert (chords <= SEGMENT * (1.0 + 1e-9)).all()
     assert (chords > 0.99 * SEGMENT).all()
+    assert case(2000, dimension, False, 1).thread.length == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("name", PEERS)

@@ -35,8 +35,6 @@ def full_state() -> dict[str, Any]:
     shown = {**estimated_state(), **{name: procedure_state("ready")[name] for name in ("procedure", "procedures")}}
     shown["plan"] = [[0.0, 0.0], [TAIL[0] + 0.007 + 0.003, TAIL[1] + 0.004]]
     shown["predicted"] |= {"tension": [3e-5] * 39, "needle_force": [2e-6, 0.0]}
-    learned = "9.61e-11 m^4/s, 95 % in 9.61e-11 to 9.61e-10; kept, as this motion does not show it"
-    shown["nodes"]["thread_model"]["values"] = {"learned stiffness_over_drag": learned}
     return shown
 
 

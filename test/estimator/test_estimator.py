@@ -1,4 +1,4 @@
-"""The estimator and its session: right and wrong models, bad input, late frames, disturbances, learned stiffness."""
+"""The estimator and its session: right and wrong models, bad input, late frames, disturbances."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
 from magnetosuture_thread.estimator.estimator import clearance_bound
 from magnetosuture_thread.estimator.session import observation_of
-from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, STIFFNESS_RANGE
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import points_at
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from test.estimator.threads import (
@@ -130,9 +128,7 @@ def test_constraints_hold_after_a_correction() -> None:
         assert estimate.converged
         gap = np.linalg.norm(estimate.positions - np.array(disc.centre), axis=1) - disc.radius - 0.5 * thread.diameter
         assert gap.min() > -1.5e-7
-        lengths = np.linalg.norm(np.diff(estimate.positions, axis=0), axis=1)
-        rest = estimator.predictor.formulation.rest_lengths(estimate.positions, pose.heading)
-        assert np.abs(rest / lengths - 1.0).max() < 1.5e-3
+        assert np.abs(estimator.predictor.formulation.strain(estimate.positions, pose.heading)).max() < 1.5e-3
 
 
 def test_a_wrong_model_is_corrected() -> None:
@@ -154,19 +150,19 @@ def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
     estimator.start(way[0])
     estimate = estimator.step(way[1], whole(true_shapes(thread_of(), way)[1], 1))
     formulation = estimator.predictor.formulation
-    rows = {each.name: each for each in formulation.margins(estimate.positions, way[1].heading)}["obstacle"]
+    rows = {each.barrier: each for each in formulation.margins(estimate.positions, way[1].heading)}["obstacle"]
     bound = estimate.margins["obstacle"].bound
-    node, last = rows.nodes[:, -1], len(estimate.positions) - 1
+    node, last = rows.node.astype(int), len(estimate.positions) - 1
     beside = [np.clip(node + apart, 0, last) for apart in (-1, 0, 1)]  # the half segments' clearance is of these too
     deviations = [
-        np.sqrt(np.einsum("ra,rab,rb->r", rows.gradient[:, 0], estimate.covariance[at], rows.gradient[:, 0]))
-        for at in beside
+        np.sqrt(np.einsum("ra,rab,rb->r", rows.normal, estimate.covariance[at], rows.normal)) for at in beside
     ]
     expected = rows.clearance - 2.3263 * np.max(deviations, axis=0)
     np.testing.assert_allclose(bound, expected, rtol=1e-4)
     assert (bound < rows.clearance)[node > 0].all()
-    flat = replace(rows, gradient=np.zeros_like(rows.gradient))  # which no motion of a node changes
-    np.testing.assert_array_equal(clearance_bound(flat, estimate.covariance), rows.clearance)
+    flat = np.zeros_like(rows.normal)[:, None]  # which no motion of a node changes
+    bound = clearance_bound(node[:, None], flat, rows.clearance, estimate.covariance)
+    np.testing.assert_array_equal(bound, rows.clearance)
 
 
 def session_of(history: float = 1.0) -> EstimatorSession:
@@ -343,94 +339,13 @@ def test_another_thread_goes_on_from_the_estimate_and_older_frames_are_refused()
     assert finer.on_pose(replace(way[0], stamp=-5.0)).problem is None  # time was set back
 
 
-def learner(thread: Thread, *names: str) -> ThreadEstimator:
-    return estimator_of(thread, options=EstimatorOptions(slow_parameters=names))
-
-
-def stiff(thread: Thread, factor: float) -> Thread:
-    return replace(thread, bending_stiffness=factor * thread.bending_stiffness)
-
-
-def ratio_of(thread: Thread) -> float:
-    return thread.bending_stiffness / thread.medium.drag_across
-
-
-def play(estimator: ThreadEstimator, way: list[NeedlePose], shapes: np.ndarray) -> list[ThreadEstimate]:
-    first = estimator.start_observed(way[0], whole(shapes[0], 0))
-    return [first, *(estimator.step(way[k], whole(shapes[k], k)) for k in range(1, len(way)))]
-
-
-@pytest.mark.parametrize("factor", [5.0, 0.2])
-def test_a_wrong_stiffness_is_found_within_its_interval_without_a_jump_and_kept_while_the_needle_rests(
-    factor: float,
-) -> None:
-    told, way = thread_of(material="polyamide_7_0"), poses(200)
-    way += [replace(way[-1], stamp=way[-1].stamp + k / RATE) for k in range(1, 300)]
-    real = stiff(told, factor)
-    shapes = true_shapes(real, way)
-    estimates = play(learner(told, STIFFNESS_OVER_DRAG), way, shapes)
-    (found,) = estimates[199].slow_parameters
-    assert found.excited
-    assert found.low <= ratio_of(real) <= found.high < 10.0**0.4 * found.low  # a fifth of what is known beforehand
-    assert ratio_of(estimates[199].thread) == pytest.approx(found.value, rel=1e-9)  # forecasts start with it
-    off = np.array([each.positions for each in estimates]) - shapes
-    assert np.abs(off[60:]).max() < 3e-5
-    if factor > 1.0:  # a softer one creeps on for longer
-        quiet = [each.slow_parameters for each in estimates[-60:]]
-        assert all(each == quiet[0] and not each[0].excited for each in quiet)
-
-
-def test_no_data_leads_beyond_the_bounds() -> None:
-    """Pieces that no thread could make, in any order, at any distance."""
-    thread, rng = thread_of(), np.random.default_rng(5)
-    estimator, way = learner(thread, STIFFNESS_OVER_DRAG), poses(120, speed=5e-3)
-    shapes, told = true_shapes(thread, way), ratio_of(thread)
-    estimator.start(way[0])
-    for k, pose in enumerate(way[1:], 1):
-        scale = 10.0 ** rng.uniform(-5.0, -1.0)
-        wild = shapes[k] + scale * rng.normal(0.0, 1.0, (1, 2)) + 0.3 * scale * rng.normal(0.0, 1.0, shapes[k].shape)
-        wild[rng.random(len(wild)) < 0.05] = rng.choice([np.nan, np.inf, 1e9])
-        piece = ThreadPiece(wild, np.full(len(wild), 1e-7), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0))
-        (each,) = estimator.step(pose, ThreadObservation((piece,), True)).slow_parameters
-        assert 0.999 * told / STIFFNESS_RANGE <= each.low <= each.value <= each.high <= 1.001 * told * STIFFNESS_RANGE
-
-
-@pytest.mark.parametrize("factor", [5.0, 0.2])
-def test_by_default_a_wrong_stiffness_is_learned_once_the_model_is_found_wrong(factor: float) -> None:
-    """So that half of the thread, hidden afterwards, goes the way that a thread of that stiffness goes."""
-    told, way, half = thread_of(material="polyamide_7_0"), poses(240), 0.5 * LENGTH
-    shapes = true_shapes(stiff(told, factor), way)
-    shown = [
-        whole(nodes, k) if k < 150 else ThreadObservation((piece_of(nodes, k, end=half),), False)
-        for k, nodes in enumerate(shapes)
-    ]
-    hidden = {}
-    for names in (AUTOMATIC,), ():
-        estimator = learner(told, *names)
-        estimates = [estimator.start_observed(way[0], shown[0])]
-        estimates += [estimator.step(*each) for each in zip(way[1:], shown[1:], strict=True)]
-        off = np.array([each.positions for each in estimates]) - shapes
-        hidden[names] = np.linalg.norm(off[150:, 13:], axis=2).max()
-        if names:
-            began = next(k for k, each in enumerate(estimates) if each.slow_parameters)
-            assert any(each.disturbances for each in estimates[: began + 1])
-            (learned,) = estimates[149].slow_parameters
-            assert learned.value == pytest.approx(factor * ratio_of(told), rel=0.03)
-            assert learned.low <= factor * ratio_of(told) <= learned.high
-    assert hidden[(AUTOMATIC,)] < 0.2 * hidden[()]
-
-
-def test_what_cannot_be_estimated_or_learned_is_refused() -> None:
-    limp, paper = replace(thread_of(), bending_stiffness=0.0), ThreadPredictor(thread_of(), formulation="paper")
+def test_what_cannot_be_estimated_is_refused() -> None:
+    paper = ThreadPredictor(thread_of(), formulation="paper")
     space = ThreadPredictor(thread_of(), Workspace((), 5e-3, dimension=3))
     for words, refused in (
         ("rod", lambda: ThreadEstimator(paper)),
         ("plane", lambda: ThreadEstimator(space)),
         ("history", lambda: EstimatorOptions(history=0.0)),
-        ("auto alone, or nothing", lambda: EstimatorOptions(slow_parameters=("drag_anisotropy",))),
-        ("auto alone, or nothing", lambda: EstimatorOptions(slow_parameters=(AUTOMATIC, STIFFNESS_OVER_DRAG))),
-        ("without stiffness or drag", lambda: learner(limp, STIFFNESS_OVER_DRAG)),
     ):
         with pytest.raises(ConfigurationError, match=words):
             refused()
-    assert learner(limp, AUTOMATIC).thread == limp

@@ -161,23 +161,6 @@ def test_forecast_goes_on_from_where_a_predictor_is(forecaster: ThreadForecaster
     np.testing.assert_allclose(rest.tails[-1], whole.tails[-1], rtol=0.0, atol=1e-12)
 
 
-def test_the_thread_of_a_start_is_forecast_in_place_of_the_own(forecaster: ThreadForecaster):
-    """As where the estimator has learned that the thread is stiffer, in a liquid that holds it less."""
-    own = forecaster.thread
-    medium = replace(own.medium, drag_across=0.7 * own.medium.drag_across)
-    stiffer = replace(own, bending_stiffness=20.0 * own.bending_stiffness, medium=medium)
-    drag = NeedleDrag(0.0255, 0.033, 1.6e-7)
-    one, other = (
-        ThreadForecaster(each, forecaster.scene, forecaster.safety, law=LAW, drag=drag) for each in (own, stiffer)
-    )
-    start = one.straight(START)
-    learned = one.forecast(replace(start, thread=stiffer), UP, HORIZON)
-    assert same(learned, other.forecast(start, UP, HORIZON))
-    before = one.forecast(start, UP, HORIZON)
-    assert np.abs(learned.vertices[-1] - before.vertices[-1]).max() > 1e-5
-    assert same(before, one.forecast(start, UP, HORIZON)), "it is of that start alone"
-
-
 def same(one: Forecast, other: Forecast) -> bool:
     """Return whether two forecasts are equal to the last bit."""
     return (
@@ -279,7 +262,6 @@ def test_first_contact_names_shape_and_time():
         ({"pose": NeedlePose(0.0, np.array([0.006, 0.0]), EAST)}, "first node"),
         ({"pose": NeedlePose(0.0, np.array([0.005, 0.0055]), EAST), "vertices": None}, "inside of a shape"),
         ({"pose": NeedlePose(0.0, np.array([0.015, 0.0]), EAST), "vertices": None}, "inside of a shape or the wall"),
-        ({"thread": thread(segments=20)}, "thread of the start: .* in length, segments, diameter, attachment"),
     ],
 )
 def test_start_that_cannot_be_used_is_refused(forecaster: ThreadForecaster, change: dict, match: str):

@@ -10,6 +10,7 @@ from magnetosuture_thread.geometry.barrier import BarrierRows
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.thread.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.thread.margins import (
+    BarrierMargins,
     Friction,
     FrictionLaw,
     FrictionState,
@@ -24,7 +25,8 @@ NODES = np.column_stack([np.arange(0.0, -8e-3, -1e-3), np.zeros(8)])  # 0 is the
 def barriers(*discs: tuple[float, float, float], others: tuple[BarrierRows, ...] = ()) -> Margins:
     """Return the margins of the nodes among discs x, y, radius."""
     around = Workspace([Disc((x, y), radius) for x, y, radius in discs], 5e-3)
-    return Margins.of([Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES), *others], 0.0)
+    rows = Connectivity(1e-3).rows(NODES), ObstacleAvoidance(around, 0.0).rows(NODES), *others
+    return Margins.of([BarrierMargins.from_rows(each) for each in rows], 0.0)
 
 
 # Two discs 0.9 mm above and below the nodes 3 and 4, and no other node.

@@ -1,4 +1,4 @@
-"""Metric, bending, chords and tension."""
+"""Bending, chords and tension."""
 
 from __future__ import annotations
 
@@ -53,22 +53,6 @@ def test_gradient_and_hessian_are_those_of_the_energy(dimension: int, clamped: b
             assert gradient[node, axis] == pytest.approx(slope, abs=1e-8)
             ahead, behind = (gradient_of(positions + s * step, heading, clamped) for s in (1.0, -1.0))
             np.testing.assert_allclose((ahead - behind)[:, axis] / 2e-5, hessian[:, node], atol=1e-8)
-
-
-def metric_of(positions: np.ndarray, along: float = 0.5, inertia: float = 0.0) -> np.ndarray:
-    """Return the compiled metric."""
-    nodes, dimension = positions.shape
-    blocks = np.empty((nodes, dimension, dimension))
-    mechanics.metric(positions, mechanics.end_corrected_weights(nodes - 1), inertia, 1.0, along, blocks)
-    return blocks
-
-
-def test_drag_is_half_along_the_thread_and_less_than_half_at_its_end():
-    metric = metric_of(np.column_stack([np.arange(5.0), np.zeros(5)]))
-    np.testing.assert_allclose(metric[1], np.diag([0.5, 1.0]))
-    np.testing.assert_allclose(metric[3], 13.0 / 12.0 * np.diag([0.5, 1.0]))
-    np.testing.assert_allclose(metric[4], 5.0 / 12.0 * np.diag([0.5, 1.0]))
-    np.testing.assert_allclose(metric.sum(axis=0), 4.0 * np.diag([0.5, 1.0]))
 
 
 @pytest.mark.parametrize("clamped", [False, True])

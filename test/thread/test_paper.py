@@ -85,8 +85,8 @@ def test_no_node_enters_an_obstacle_and_one_inside_is_pushed_out(obstacle: Disc 
 
     def least(positions: np.ndarray) -> float:
         rows = formulation.margins(positions, east())[-2]
-        assert rows.name == "obstacle"
-        return float(rows.value[rows.nodes[:, 0] > 0].min(initial=np.inf))
+        assert rows.barrier == "obstacle"
+        return float(rows.value[rows.node > 0].min(initial=np.inf))
 
     touched = False
     for done in followed(formulation, straight(thread), lambda k: k * 4e-5 * np.array([0.0, 1.0]), 300):
@@ -109,3 +109,12 @@ def test_a_step_that_ends_deep_in_an_obstacle_says_so():
     leap = formulation.step(ThreadState.at_rest(straight(thread)), lead(np.array([0.0, 0.0043])), DT)
     assert not leap.converged
     assert "not converged, a node is" in leap.status
+
+
+def test_a_thread_that_its_slacks_let_grow_is_not_converged():
+    thread = polyamide()
+    soft = PaperOptions.tuned(0.01)._replace(connectivity_weight=1e-6)
+    formulation = formulated(thread, name="paper", paper=soft)
+    done = followed(formulation, straight(thread), lambda k: k * 4e-4 * east(), 100)[-1]
+    assert not done.converged
+    assert "times as long as it is" in done.status

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
-from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 
@@ -225,3 +230,30 @@ def test_any_thread_at_any_times_stays_whole(
         assert prediction.residual < 1e-6
         assert np.abs(prediction.strain).max() < 5e-3 or not prediction.converged
         assert np.abs(prediction.strain).max() < 5e-2
+
+
+@pytest.mark.parametrize("twin", [copy.deepcopy, lambda predictor: pickle.loads(pickle.dumps(predictor))])
+def test_a_copy_of_a_predictor_goes_on_alike_and_leaves_the_original_alone(twin: Callable[[Any], Any]):
+    predictor, other = started((Disc((-0.005, 0.002), 0.0015),)), started((Disc((-0.005, 0.002), 0.0015),))
+    for k in range(1, 20):
+        prediction = predictor.step(pose(0.02 * k, 0.0, 1e-4 * k))
+        other.step(pose(0.02 * k, 0.0, 1e-4 * k))
+    copied, told = twin(predictor), twin(prediction)
+    np.testing.assert_array_equal(told.margins["obstacle"].clearance, prediction.margins["obstacle"].clearance)
+    np.testing.assert_array_equal(told.tension, prediction.tension)
+    expected = [other.step(pose(0.02 * k, 0.0, 1e-4 * k)).positions for k in range(20, 24)]
+    for original in (copied, predictor):
+        found = [original.step(pose(0.02 * k, 0.0, 1e-4 * k)).positions for k in range(20, 24)]
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_numbers_of_numpy_are_stamps():
+    predictor = new()
+    predictor.start(NeedlePose(np.float32(0.0), (0.0, 0.0), (1.0, 0.0)))  # type: ignore[arg-type]
+    assert predictor.step(NeedlePose(np.float32(0.02), (1e-4, 0.0), (1.0, 0.0))).converged  # type: ignore[arg-type]
+
+
+def test_a_thread_that_nothing_resists_is_refused():
+    for medium in (Medium(1.0, 0.0), Medium(0.0, 0.0)):
+        with pytest.raises(ConfigurationError, match=r"thread\.medium.*drag above 0"):
+            Thread("limp", 0.019, 25, 6e-5, 0.0, medium, Attachment.PINNED)

@@ -118,7 +118,9 @@ def indefinite() -> ChainProgram:
 
 @pytest.mark.parametrize("solver", [BandedSolver(), OsqpSolver()], ids=lambda solver: solver.name)
 @pytest.mark.parametrize("program", [infeasible(), nothing(), indefinite()])
-def test_what_cannot_be_solved_is_said_so_and_the_next_program_is_solved(solver: Solver, program: ChainProgram):
+def test_what_cannot_be_solved_is_said_so_and_the_next_program_is_solved(
+    solver: Solver, program: ChainProgram, capfd: pytest.CaptureFixture[str]
+):
     bad = solved(solver, program)
     assert bad.status != "solved"
     assert bad.residuals.largest > 1e-2

@@ -133,6 +133,37 @@ def test_several_barriers_hold_together_beside_the_wall_and_a_post():
     assert list(held[-1].margins) == ["connectivity", "compression", "obstacle", "wall", "tip_keep_in", "moving_disc"]
 
 
+def test_a_barrier_knows_where_the_needle_is():
+    """The end of the thread stays near the needle's axis, which turns."""
+
+    class LeftOfNeedle(Barrier):
+        name, most = "left_of_needle", 2e-3
+
+        def value(self, positions: np.ndarray) -> np.ndarray:
+            assert self.needle is not None
+            tail, (x, y) = self.needle
+            off = positions[-1] - tail
+            return np.array([self.most - x * off[1] + y * off[0]])
+
+        def gradient(self, positions: np.ndarray) -> Gradient:
+            assert self.needle is not None
+            _, (x, y) = self.needle
+            return Gradient(np.array([[len(positions) - 1]]), np.array([[[y, -x]]]))
+
+    free, held = predicted(), predicted(LeftOfNeedle())
+    left = LeftOfNeedle()
+    clearances = []
+    for run in (free, held):
+        found = []
+        for step, prediction in enumerate(run, 1):
+            left.move_to(prediction.stamp, 0.0, (prediction.positions[0], around(step).heading))
+            found.append(float(left.value(prediction.positions)[0]))
+        clearances.append(min(found))
+    assert clearances[0] < -1e-4
+    assert clearances[1] > -HOLDS
+    assert held[-1].margins["left_of_needle"].minimum > -HOLDS
+
+
 def test_a_failed_row_leaves_the_thread_where_it_was():
     class Fragile(MovingDisc):  # type: ignore[misc, valid-type]
         broken = False

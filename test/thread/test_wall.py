@@ -30,8 +30,8 @@ def test_a_thread_pushed_sideways_into_the_wall_slides_along_it(name: str, attac
     assert -2e-5 < outside(thread, steps) < OUTSIDE
     assert all(done.converged for done in steps)
     wall = formulation.margins(steps[-1].state.positions, east())[-1]
-    assert wall.name == "wall"
-    assert wall.clearance[wall.nodes[:, 0] > 0].min() > -OUTSIDE
+    assert wall.barrier == "wall"
+    assert wall.clearance[wall.node > 0].min() > -OUTSIDE
 
 
 @pytest.mark.parametrize("name", ["rod", "paper"])

@@ -185,9 +185,6 @@ function showThread({ graph, since }) {
     rows.push(["Needle pull", micronewtons(Math.hypot(...predicted.needle_force))]);
   }
   if (predicted) rows.push(["Step", isNumber(predicted.step_time) ? `${(predicted.step_time * 1e3).toFixed(2)} ms` : "–"]);
-  if (estimate !== "none") for (const [key, value] of Object.entries(graph.nodes?.thread_model?.values ?? {})) {
-    if (key.startsWith("learned ")) rows.push([`${capital(key.slice(8).replaceAll("_", " "))}: ${value}`, null]);
-  }
   const list = find("margins");
   list.classList.toggle("stale", Boolean(old));
   fill(list, rows, ([name, value, level]) => {

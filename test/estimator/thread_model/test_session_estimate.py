@@ -150,20 +150,6 @@ def test_other_settings_keep_the_estimate(values: dict[str, Any]):
     assert error_percent(estimated(follow(session, 31, 45)[-1]).positions[-1:], NODES[-1, -1:]) < 0.8
 
 
-def test_what_is_learned_of_the_thread_is_kept_in_another_scene_and_not_of_another_thread():
-    session = ThreadSession(made(estimator_slow_parameters=["stiffness_over_drag"]), None)
-    before = estimated(follow(session, 0, 30)[-1])
-    session.change(session.settings, scene_with(Disc((0.05, 0.05), 1e-3)))
-    kept = estimated(follow(session, 30, 31)[-1])
-    assert kept.slow_parameters[0].value == pytest.approx(before.slow_parameters[0].value, rel=0.05)
-    told = session.thread.bending_stiffness / session.thread.medium.drag_across
-    assert abs(kept.slow_parameters[0].value / told - 1.0) > 0.1
-    session.change(replace(session.settings, viscosity=1.7), session.scene)
-    anew = estimated(session.on_pose(stamp_of(WAY[31]), at(WAY[31])))
-    told = session.thread.bending_stiffness / session.thread.medium.drag_across
-    assert anew.slow_parameters[0].value == pytest.approx(told, rel=1e-6)
-
-
 def test_a_scene_that_appears_pushes_the_estimate_out():
     session = ThreadSession(made(), None)
     estimate = estimated(follow(session, 0, 30)[-1])
