@@ -13,10 +13,9 @@ from magnetosuture_thread.coils.needle_motion import (
     moved_needle,
     needle_margin,
 )
+from magnetosuture_thread.geometry.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.compiled import compiled, compiled_uncounted_without_gil, compiled_within
-from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
-from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
+from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts, half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.banded import SolverBuffers
