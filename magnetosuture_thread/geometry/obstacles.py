@@ -1,4 +1,4 @@
-"""Obstacles in flat arrays for compiled code, and signed distances and contacts of points: for thread, needle and planner alike.
+"""Obstacles in flat arrays for compiled code; distances and contacts of points, for thread, needle and planner alike.
 
 The edges of a polygon that follow one another are kept in blocks of `BLOCK`, each in a circle, so that those far away
 cost one test.
