@@ -506,13 +506,14 @@ def line_covered(box: Box, line: Points, width_px: float) -> Light:
     corners = zip(firsts.tolist(), lasts.tolist(), low.tolist(), high.tolist(), strict=True)
     for first, last, (left, top), (right, bottom) in corners:
         if left < right and top < bottom:
-            part, piece = (slice(top, bottom), slice(left, right)), line[first : last + 1]
-            drawn = covered(
-                part, lambda canvas, at, p=piece: cv2.polylines(canvas, [at(p)], False, 255, wide, cv2.LINE_8, 4)
-            )
+            part = slice(top, bottom), slice(left, right)
             inside = result[_within(part, box)]
-            np.maximum(inside, drawn, out=inside)
+            np.maximum(inside, _line_drawn(part, line[first : last + 1], wide), out=inside)
     return np.asarray(result * np.float32(min(1.0, width_px * OVERSAMPLING / wide)))
+
+
+def _line_drawn(box: Box, line: Points, wide: int) -> Light:
+    return covered(box, lambda canvas, at: cv2.polylines(canvas, [at(line)], False, 255, wide, cv2.LINE_8, 4))
 
 
 @compiled

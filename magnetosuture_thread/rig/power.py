@@ -239,6 +239,7 @@ def answer(address: int, command: int, data: bytes) -> bytes:
 
 
 TIMEOUT = 5.0  # s for the boards to be taken away
+NOT_OPEN = "the simulated boards are not open"
 
 
 class Line:
@@ -396,9 +397,15 @@ class StageProcess:
         self._pipe: Connection | None = None
 
     @property
-    def pid(self) -> int | None:
-        """Number of the process, None where there is none."""
-        return self._process and self._process.pid
+    def pid(self) -> int:
+        """Number of the process.
+
+        Raises:
+            GraphError: there is none.
+        """
+        if self._process is None or self._process.pid is None:
+            raise GraphError(NOT_OPEN)
+        return self._process.pid
 
     def open(self) -> None:
         """Start the process, and wait until its boards can be found.
@@ -439,7 +446,7 @@ class StageProcess:
 
     def _receive(self) -> Any:
         if self._pipe is None or self._process is None:
-            raise GraphError("the simulated boards are not open")
+            raise GraphError(NOT_OPEN)
         try:
             return self._pipe.recv()
         except (EOFError, OSError):
