@@ -7,7 +7,7 @@ needle's, so steps in turn would not be stable.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,7 +47,8 @@ MIN_PART = 1e-6  # of Newton's move, below which the line search ends
 MAX_ITERATIONS = 60  # of Newton in a step
 CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
 ROUNDING, MIN_ENERGY = 1e-10, 1e-18  # of the energy, a sum of larger terms; and J, of a move by the tolerance
-EXACT, CONVEX = np.bool_(False), np.bool_(True)  # typed: a kernel is compiled again for each one that is written out
+# Typed: a kernel is compiled again for each one that is written out.
+EXACT, CONVEX = cast(bool, np.bool_(False)), cast(bool, np.bool_(True))
 STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
 
 
