@@ -347,7 +347,12 @@ def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Sh
                 if shapes.convex[i] == 0.0 or count >= most:
                     continue
                 gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
-                if polygon_gap(ax + s * ex, ay + s * ey, shapes, p)[0] < 0.0:
+                # Inside where it is to the left of both edges of the corner.
+                last = i - 1 if i > shapes.starts[p] else shapes.starts[p + 1] - 1
+                after = i + 1 if i + 1 < shapes.starts[p + 1] else shapes.starts[p]
+                ux, uy = corners[i, 0] - corners[last, 0], corners[i, 1] - corners[last, 1]
+                vx, vy = corners[after, 0] - corners[i, 0], corners[after, 1] - corners[i, 1]
+                if ux * ny - uy * nx > 0.0 and vx * ny - vy * nx > 0.0:
                     gap, nx, ny = -gap, -nx, -ny
                 if gap < radius:
                     rows[count, 0], rows[count, 1], rows[count, 2] = a, s, radius - gap
