@@ -7,7 +7,6 @@ from typing import Any
 
 from magnetosuture_thread.bags.cdr import Stamp, pack
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
-from magnetosuture_thread.geometry.obstacles.shapes import Ring
 from magnetosuture_thread.geometry.scene import (
     MAX_NAME_CHARS,
     MAX_OUTLINES,
@@ -18,6 +17,7 @@ from magnetosuture_thread.geometry.scene import (
     Scene,
     SceneShape,
 )
+from magnetosuture_thread.geometry.shapes import Ring
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.settings.interface import DISH_FRAME, SCENE
 

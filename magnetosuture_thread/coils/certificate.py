@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData, measure
+from magnetosuture_thread.geometry.obstacles import EDGE_WIDTH, WorkspaceData, measure
 from magnetosuture_thread.geometry.polyline import Points
 
 ROUNDING = 1e-13

@@ -23,7 +23,7 @@ from magnetosuture_thread.coils.certificate import (
 )
 from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_chord
-from magnetosuture_thread.geometry.obstacles.distances import ContactRows, polygon_rows, shape_distance
+from magnetosuture_thread.geometry.obstacles import ContactRows, polygon_rows, shape_distance
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.certificate import FilterData, PosedNeedle, pose_needle
 from magnetosuture_thread.coils.needle_motion import filter_velocity, moved_needle, needle_margin
+from magnetosuture_thread.geometry.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.compiled import compiled, compiled_uncounted, compiled_within
-from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
-from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
+from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts, half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.barriers import segment_rows_of
 from magnetosuture_thread.thread.mechanics import RodProperties

@@ -14,7 +14,6 @@ import numpy as np
 import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
-from magnetosuture_thread.geometry.obstacles.shapes import Ring, Vertex
 from magnetosuture_thread.geometry.scene import (
     MAX_COORDINATE,
     MAX_NAME_CHARS,
@@ -29,6 +28,7 @@ from magnetosuture_thread.geometry.scene import (
     is_name,
     is_number,
 )
+from magnetosuture_thread.geometry.shapes import Ring, Vertex
 from magnetosuture_thread.settings.configuration import suggest_names
 from magnetosuture_thread.settings.errors import ConfigurationError
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from magnetosuture_thread.geometry.compiled import compiled, compiled_without_gil
-from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
+from magnetosuture_thread.geometry.obstacles import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene
 

@@ -31,6 +31,7 @@ GLEAM_BGR = (88.0, 84.0, 78.0)
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 REACH_PX = 24.0  # of shadows and blur around what moves
+SHIFTS = 64  # px by which noise is shifted at the most, along rows and columns: 64^6 ways, of three colours
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
 RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
 GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
@@ -168,8 +169,11 @@ class DishCamera:
         self._background = _StillLife(scene, self._lighting, view, size, self._random).draw()
         self._still = self._through_lens(self._background)
         self._noise = [self._noise_field() for _ in range(noise_fields)]
-        self._exposed = [self._expose(self._still, noise, 1.0) for noise in self._noise]
-        self._shifts, self._shifting = np.zeros((noise_fields, 3, 2), np.int64), np.random.default_rng(seed)
+        self._whole = slice(0, size[1]), slice(0, size[0])
+        unshifted, self._shifting = np.zeros((noise_fields, 3, 2), np.int64), np.random.default_rng(seed)
+        self._shifts = unshifted.copy()
+        self._exposed = [self._expose(self._still, self._noise_in(self._whole, k), 1.0) for k in range(noise_fields)]
+        self._shifts = unshifted  # what moves fits into these pictures at first
 
     def render(
         self, tail: Points, heading: float, thread: Points, covers: tuple[Cover, ...] = (), gain: float = 1.0
@@ -191,8 +195,12 @@ class DishCamera:
         edges = [self.view.to_pixels(cover.outline) for cover in covers]
         box = box_around(np.vstack([outline, line, *edges]), self.size, REACH_PX)
         chosen = int(self._random.integers(len(self._noise)))
-        noise = self._noise[chosen]
-        image = self._exposed[chosen].copy() if gain == 1.0 else self._expose(self._still, noise, gain)
+        usual = gain == 1.0
+        image = (
+            self._exposed[chosen].copy()
+            if usual
+            else self._expose(self._still, self._noise_in(self._whole, chosen), gain)
+        )
         if box is not None:
             region = self._background[box].copy()
             self._add_strand_and_needle(region, box, line, outline, tail, heading)
@@ -248,21 +256,26 @@ class DishCamera:
         return np.asarray(cv2.GaussianBlur(light, (0, 0), self._lighting.blur_px), dtype=np.float32)
 
     def _noise_field(self) -> Light:
-        """Return noise for white light of level 1; the sensor's colour interpolation spreads it a little."""
+        """Return noise for white light of level 1; the sensor's colour interpolation spreads it a little.
+
+        Its shape is (3, height + SHIFTS, width + SHIFTS): it goes on beyond its borders, by as much as it is shifted.
+        """
         width, height = self.size
         noise = self._random.standard_normal((height, width, 3), dtype=np.float32)
         # 1.6 at a light of level 90, before the sensor's interpolation spreads it.
         level = np.float32(self._lighting.noise * 1.6 / np.sqrt(90.0))
-        return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.55) * level, dtype=np.float32)
+        field = np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.55) * level, dtype=np.float32)
+        return np.pad(field.transpose(2, 0, 1), ((0, 0), (0, SHIFTS), (0, SHIFTS)), mode="wrap")
 
     def _noise_in(self, box: Box, chosen: int) -> Light:
-        """Return a field's noise in a region, shifted as at no use before; fields go on beyond their borders."""
-        field, noise = self._noise[chosen], []
-        for colour, shift in enumerate(self._shifts[chosen]):
-            rows, columns = (np.arange(part.start, part.stop) + by for part, by in zip(box, shift, strict=True))
-            noise.append(field[:, :, colour].take(rows, axis=0, mode="wrap").take(columns, axis=1, mode="wrap"))
-        self._shifts[chosen] = self._shifting.integers(field.shape[:2], size=(3, 2))
-        return np.dstack(noise)
+        """Return a field's noise in a region, shifted as at no use before, shape (rows, columns, 3)."""
+        rows, columns = box
+        planes = [
+            plane[rows.start + down : rows.stop + down, columns.start + right : columns.stop + right]
+            for plane, (down, right) in zip(self._noise[chosen], self._shifts[chosen], strict=True)
+        ]
+        self._shifts[chosen] = self._shifting.integers(SHIFTS, size=(3, 2))
+        return np.asarray(cv2.merge(planes), dtype=np.float32)
 
     def _expose(self, light: Light, noise: Light, gain: float) -> Image:
         """Expose the sensor, add its noise, which grows with the root of the light, and round to 8 bits."""
@@ -480,16 +493,22 @@ def line_covered(box: Box, line: Points, width_px: float) -> Light:
         line: vertices, shape (m, 2) [px].
         width_px: of the line; less than a quarter of a pixel is drawn as that and fainter.
     """
-    result = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.float32)
+    origin, end = np.array([box[1].start, box[0].start]), np.array([box[1].stop, box[0].stop])
+    result = np.zeros(end[::-1] - origin[::-1], np.float32)
     wide = max(1, round(width_px * OVERSAMPLING))
     length = float(np.hypot(*np.diff(line, axis=0).T).sum())
     count = max(1, round(60.0 * (len(line) - 1) / max(length, 60.0)))
-    for first in range(0, len(line) - 1, count):
-        piece = line[first : first + count + 1]
-        part = box_around(piece, (box[1].stop, box[0].stop), 3.0 + width_px)
-        if part is not None:
-            inside, drawn = _within(part, box), _line_drawn(part, piece, wide)
-            np.maximum(result[inside], drawn, out=result[inside])
+    firsts = np.arange(0, len(line) - 1, count)
+    lasts, margin = np.minimum(firsts + count, len(line) - 1), 3.0 + width_px
+    low = np.minimum(np.minimum.reduceat(line, firsts), line[lasts]) - margin
+    high = np.maximum(np.maximum.reduceat(line, firsts), line[lasts]) + margin
+    low, high = np.maximum(np.floor(low), origin).astype(int), np.minimum(np.ceil(high), end).astype(int)
+    corners = zip(firsts.tolist(), lasts.tolist(), low.tolist(), high.tolist(), strict=True)
+    for first, last, (left, top), (right, bottom) in corners:
+        if left < right and top < bottom:
+            part = slice(top, bottom), slice(left, right)
+            inside = result[_within(part, box)]
+            np.maximum(inside, _line_drawn(part, line[first : last + 1], wide), out=inside)
     return np.asarray(result * np.float32(min(1.0, width_px * OVERSAMPLING / wide)))
 
 

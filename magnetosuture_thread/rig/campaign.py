@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
+from magnetosuture_thread.geometry.obstacles import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.planning import executor

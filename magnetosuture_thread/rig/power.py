@@ -7,13 +7,10 @@ lost the processor. A driver takes such a board for dead.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import select
 import struct
-import subprocess
-import sys
 import threading
 import time
 import tty
@@ -21,8 +18,11 @@ from collections import defaultdict, deque
 from collections.abc import Sequence
 from contextlib import suppress
 from enum import IntEnum
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,6 +239,7 @@ def answer(address: int, command: int, data: bytes) -> bytes:
 
 
 TIMEOUT = 5.0  # s for the boards to be taken away
+NOT_OPEN = "the simulated boards are not open"
 
 
 class Line:
@@ -391,14 +392,20 @@ class StageProcess:
     """
 
     def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
-        self._arguments = json.dumps([list(ports), supply, resistance, inductance])
-        self._bytes = 2 * len(ports) * np.dtype(float).itemsize
-        self._process: subprocess.Popen[bytes] | None = None
+        self._arguments = list(ports), supply, resistance, inductance
+        self._process: SpawnProcess | None = None
+        self._pipe: Connection | None = None
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
-        return self._running().pid
+        """Number of the process.
+
+        Raises:
+            GraphError: there is none.
+        """
+        if self._process is None or self._process.pid is None:
+            raise GraphError(NOT_OPEN)
+        return self._process.pid
 
     def open(self) -> None:
         """Start the process, and wait until its boards can be found.
@@ -407,28 +414,24 @@ class StageProcess:
             ConfigurationError: a path cannot be used.
             GraphError: the process ended.
         """
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, self._arguments],
-            bufsize=0,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is for the rig, which then takes the boards away
-        )
-        problem = json.loads(self._read())
-        if problem is not None:
+        context = get_context("spawn")
+        self._pipe, end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(end, *self._arguments), daemon=True)
+        self._process.start()
+        end.close()
+        if (problem := self._receive()) is not None:
             self.close()
             raise ConfigurationError(*problem)
 
     def close(self) -> None:
         """Take the boards away; harmless if there are none."""
-        if self._process is None:
+        if self._process is None or self._pipe is None:
             return
-        process, self._process = self._process, None
-        try:
-            process.communicate(timeout=TIMEOUT)  # closes its input, which ends it
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
+        self._pipe.close()  # which ends it
+        self._process.join(TIMEOUT)
+        self._process.kill()
+        self._process.join()
+        self._process = self._pipe = None
 
     def currents(self) -> NDArray[np.float64]:
         """Return the coils' currents now, shape (2 boards,) [A].
@@ -436,46 +439,37 @@ class StageProcess:
         Raises:
             GraphError: the process ended.
         """
-        with suppress(BrokenPipeError):  # reading tells
-            cast(BinaryIO, self._running().stdin).write(b"?")
-        return np.frombuffer(self._read(self._bytes))
+        if self._pipe is not None:
+            with suppress(OSError):  # receiving tells
+                self._pipe.send(None)
+        return np.asarray(self._receive())
 
-    def _read(self, size: int | None = None) -> bytes:
-        """Return so many bytes, or a line, of what the process says."""
-        process = self._running()
-        answers = cast(BinaryIO, process.stdout)
-        said = answers.readline() if size is None else answers.read(size)
-        if len(said) < (size or 1):
-            raise GraphError(f"the process with the simulated boards ended (exit code {process.wait()})")
-        return said
-
-    def _running(self) -> subprocess.Popen[bytes]:
-        if self._process is None:
-            raise GraphError("the simulated boards are not open")
-        return self._process
+    def _receive(self) -> Any:
+        if self._pipe is None or self._process is None:
+            raise GraphError(NOT_OPEN)
+        try:
+            return self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            code = self._process.exitcode
+            raise GraphError(f"the process with the simulated boards ended (exit code {code})") from None
 
 
-def serve(stage: PowerStage, asks: BinaryIO, answers: BinaryIO) -> int:
-    """Open a stage, say how that went, and tell its currents as often as asked, until nobody can ask any more."""
-    try:
-        stage.open()
-    except ConfigurationError as error:
-        answers.write(json.dumps([error.name, error.value, error.expectation]).encode() + b"\n")
-        return 1
-    try:
-        answers.write(json.dumps(None).encode() + b"\n")
-        while asks.read(1):
-            answers.write(stage.currents().tobytes())
-    except BrokenPipeError:
-        pass  # who asked is gone
-    finally:
-        stage.close()
-    return 0
-
-
-if __name__ == "__main__":
+def _serve(pipe: Connection, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
+    """Open a stage, send how that went, and its currents as often as asked, until nobody can ask any more."""
+    os.setsid()  # Ctrl-C is for the rig, which then takes the boards away
     with suppress(OSError):  # only some may
         # Before the processes that boards would not share a processor with, where the user may say so.
         os.nice(-10)
-    with open(sys.stdin.fileno(), "rb", 0) as asking, open(sys.stdout.fileno(), "wb", 0) as answering:
-        sys.exit(serve(PowerStage(*json.loads(sys.argv[1])), asking, answering))
+    stage = PowerStage(ports, supply, resistance, inductance)
+    try:
+        stage.open()
+    except ConfigurationError as error:
+        pipe.send((error.name, error.value, error.expectation))
+        return
+    with suppress(EOFError, OSError):  # who asked is gone
+        pipe.send(None)
+        while True:
+            pipe.recv()
+            pipe.send(stage.currents())
+    stage.close()

@@ -22,8 +22,14 @@ from magnetosuture_thread.geometry.barrier import (
 )
 from magnetosuture_thread.geometry.compiled import compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
-from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, WorkspaceData, find_contacts, wall_contact
-from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
+from magnetosuture_thread.geometry.obstacles import (
+    Contacts,
+    Workspace,
+    WorkspaceData,
+    find_contacts,
+    half_segment_distance,
+    wall_contact,
+)
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.mechanics import RodProperties, chord_lengths
 

@@ -21,9 +21,9 @@ import math
 
 import numpy as np
 
+from magnetosuture_thread.geometry.chords import find_chord_contacts
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     BEFORE,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.settings.errors import ConfigurationError
 
@@ -21,6 +21,7 @@ Vector = NDArray[np.float64]
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
+BLOCK = 8  # edges of a polygon that are passed over together where all of them are too far
 
 
 class Shapes(NamedTuple):
@@ -32,6 +33,8 @@ class Shapes(NamedTuple):
         convex: 1 at corners that stick out of the solid, else 0, shape (c,).
         starts: where each polygon begins in `corners`, and the end, shape (p + 1,).
         boxes: least x, least y, greatest x, greatest y of each polygon, shape (p, 4) [m].
+        blocks: the same of each `BLOCK` edges of a polygon, in the order of `corners`, shape (b, 4) [m].
+        block_starts: where the blocks of each polygon begin, and the end, shape (p + 1,).
         grid: least x and y of the cells of `clearances`, and their side, shape (3,) [m].
         clearances: at the least, of all points of a cell, rows along y, shape (h, w) [m].
         wall: radius of the dish's wall around the origin, infinite if there is none [m].
@@ -45,6 +48,8 @@ class Shapes(NamedTuple):
     convex: Vector
     starts: NDArray[np.int64]
     boxes: Vector
+    blocks: Vector
+    block_starts: NDArray[np.int64]
     grid: Vector
     clearances: Vector
     wall: float
@@ -85,7 +90,7 @@ class Surface:
         wall = math.inf if self.wall_radius is None else self.wall_radius
         discs = np.array([(*disc.centre[:2], disc.radius) for disc in self.discs], dtype=np.float64).reshape(-1, 3)
         rings = [_directed(ring) for ring in self.polygons]
-        boxes = np.array([(*ring.min(axis=0), *ring.max(axis=0)) for ring in rings], dtype=np.float64).reshape(-1, 4)
+        boxes, blocks = _boxes(rings), [_boxes(_edge_blocks(ring)) for ring in rings]
         reached = [*boxes, *((x - r, y - r, x + r, y + r) for x, y, r in [*discs, (0.0, 0.0, wall)] if r < math.inf)]
         grid, cells = np.array([0.0, 0.0, 1.0]), np.full((1, 1), np.inf)
         if reached:
@@ -98,6 +103,8 @@ class Surface:
             convex=np.concatenate([np.zeros(0), *(_convex(ring) for ring in rings)]),
             starts=np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int64),
             boxes=boxes,
+            blocks=np.concatenate([np.zeros((0, 4)), *blocks]),
+            block_starts=np.cumsum([0, *map(len, blocks)]).astype(np.int64),
             grid=grid,
             clearances=cells,
             wall=float(wall),
@@ -125,6 +132,17 @@ def _convex(ring: Vector) -> Vector:
     return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
 
 
+def _boxes(parts: list[Vector]) -> Vector:
+    """Return least x and y, greatest x and y of sets of points, shape (k, 4)."""
+    return np.array([(*part.min(axis=0), *part.max(axis=0)) for part in parts], dtype=np.float64).reshape(-1, 4)
+
+
+def _edge_blocks(ring: Vector) -> list[Vector]:
+    """Return the corners of each `BLOCK` edges of a ring; edge i ends at corner i."""
+    ends = np.concatenate([ring[-1:], ring])
+    return [ends[first : first + BLOCK + 1] for first in range(0, len(ring), BLOCK)]
+
+
 @compiled_inline
 def clear(x: float, y: float, reach: float, shapes: Shapes) -> bool:
     """Return whether nothing is within reach, as far as the grid tells; from beyond the grid all is as far or farther.
@@ -139,31 +157,53 @@ def clear(x: float, y: float, reach: float, shapes: Shapes) -> bool:
 
 
 @compiled_inline
-def polygon_gap(x: float, y: float, shapes: Shapes, p: int) -> tuple[float, float, float, float]:
-    """Return signed distance from polygon p, its gradient (n_x, n_y), and its curvature [m, 1, 1, 1/m]."""
+def _box_square(x: float, y: float, box: Vector) -> float:
+    """Return the squared distance of a point from a box, 0 within it."""
+    dx, dy = max(box[0] - x, x - box[2], 0.0), max(box[1] - y, y - box[3], 0.0)
+    return float(dx * dx + dy * dy)
+
+
+@compiled_uncounted
+def polygon_gap(x: float, y: float, shapes: Shapes, p: int) -> tuple[float, float, float, float, int, int]:
+    """Return signed distance from polygon p, its gradient (n_x, n_y), its curvature [m, 1, 1, 1/m], and the edge.
+
+    The edge is that which is nearest, as the indices of its two corners.
+    """
     corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
-    least, nearest, last, place, inner = np.inf, 0, 0, 0.0, 0.0
-    j = end - 1
-    for i in range(start, end):
-        ex, ey = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1]
-        dx, dy = x - corners[j, 0], y - corners[j, 1]
-        s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
-        t = min(max(s, 0.0), 1.0)
-        distance = (dx - t * ex) ** 2 + (dy - t * ey) ** 2
+    first, least = shapes.block_starts[p], np.inf
+    closest = first
+    for k in range(first, shapes.block_starts[p + 1]):
+        distance = _box_square(x, y, shapes.blocks[k])
         if distance < least:
-            least, nearest, last, place, inner = distance, i, j, t, s
-        j = i
+            least, closest = distance, k
+    least, nearest, last, place, inner = np.inf, 0, 0, 0.0, 0.0
+    # The closest block first, then all that may be closer than what it has.
+    for turn in range(first - 1, shapes.block_starts[p + 1]):
+        k = closest if turn < first else turn
+        if turn == closest or _box_square(x, y, shapes.blocks[k]) >= least:
+            continue
+        begin = start + BLOCK * (k - first)
+        j = end - 1 if k == first else begin - 1
+        for i in range(begin, min(begin + BLOCK, end)):
+            ex, ey = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1]
+            dx, dy = x - corners[j, 0], y - corners[j, 1]
+            s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
+            t = min(max(s, 0.0), 1.0)
+            distance = (dx - t * ex) ** 2 + (dy - t * ey) ** 2
+            if distance < least:
+                least, nearest, last, place, inner = distance, i, j, t, s
+            j = i
     ex, ey = corners[nearest, 0] - corners[last, 0], corners[nearest, 1] - corners[last, 1]
     dx, dy = x - corners[last, 0], y - corners[last, 1]
     distance = math.sqrt(least)
     if distance < 1e-12:
         size = math.sqrt(ex * ex + ey * ey)
-        return 0.0, ey / size, -ex / size, 0.0
+        return 0.0, ey / size, -ex / size, 0.0, last, nearest
     # Beside an edge its side tells; off its ends whether the corner sticks out of the solid.
     beside = place == inner
     within = ex * dy - ey * dx > 0.0 if beside else shapes.convex[last if place == 0.0 else nearest] == 0.0
     gap = -distance if within else distance
-    return gap, (dx - place * ex) / gap, (dy - place * ey) / gap, 0.0 if beside else 1.0 / gap
+    return gap, (dx - place * ex) / gap, (dy - place * ey) / gap, 0.0 if beside else 1.0 / gap, last, nearest
 
 
 @compiled
@@ -183,9 +223,12 @@ def _find_clearances(shapes: Shapes) -> None:
             shapes.clearances[i, j] = gap - 0.75 * side  # half a diagonal and more
 
 
-@compiled_inline
+@compiled_uncounted
 def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: Vector) -> int:
     """Write what a round point sinks into; return how many.
+
+    In a corner that opens away from the solid both edges hold it. By the nearer one alone the least energy would be at
+    a kink, where no force is balanced and Newton's iteration goes from one side to the other without end.
 
     Args:
         x: of its centre [m].
@@ -215,33 +258,50 @@ def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: Vect
     for p in range(shapes.boxes.shape[0]):
         box = shapes.boxes[p]
         if box[0] - radius < x < box[2] + radius and box[1] - radius < y < box[3] + radius and count < most:
-            gap, nx, ny, bend = polygon_gap(x, y, shapes, p)
-            if gap < radius:
-                rows[count, 2], rows[count, 3], rows[count, 4], rows[count, 5] = radius - gap, nx, ny, bend
-                count += 1
+            gap, nx, ny, bend, last, nearest = polygon_gap(x, y, shapes, p)
+            if gap >= radius:
+                continue
+            rows[count, 2], rows[count, 3], rows[count, 4], rows[count, 5] = radius - gap, nx, ny, bend
+            count += 1
+            start, end, corners = shapes.starts[p], shapes.starts[p + 1], shapes.corners
+            before, after = last - 1 if last > start else end - 1, nearest + 1 if nearest + 1 < end else start
+            for corner, a, b in ((last, before, last), (nearest, nearest, after)):
+                if shapes.convex[corner] == 1.0 or count >= most:
+                    continue
+                ex, ey = corners[b, 0] - corners[a, 0], corners[b, 1] - corners[a, 1]
+                size = math.sqrt(ex * ex + ey * ey)
+                nx, ny = ey / size, -ex / size
+                gap = nx * (x - corners[corner, 0]) + ny * (y - corners[corner, 1])
+                if gap < radius:
+                    rows[count, 2], rows[count, 3], rows[count, 4], rows[count, 5] = radius - gap, nx, ny, 0.0
+                    count += 1
     return count
 
 
 @compiled_inline
 def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> tuple[float, float, float, float]:
-    """Return distance of a point c from the line through a and b, its normal away from c, and where (0 at a)."""
+    """Return distance of a point c from the segment from a to b, its normal away from c, and where (0 at a, 1 at b)."""
     ex, ey = bx - ax, by - ay
-    size = math.sqrt(ex * ex + ey * ey)
-    nx, ny = -ey / size, ex / size
-    gap = nx * (ax - cx) + ny * (ay - cy)
-    s = -((ax - cx) * ex + (ay - cy) * ey) / (size * size)
-    if gap < 0.0:
-        gap, nx, ny = -gap, -nx, -ny
-    return gap, nx, ny, s
+    s = min(max(((cx - ax) * ex + (cy - ay) * ey) / (ex * ex + ey * ey), 0.0), 1.0)
+    if 0.0 < s < 1.0:
+        size = math.sqrt(ex * ex + ey * ey)
+        nx, ny = -ey / size, ex / size
+        gap = nx * (ax - cx) + ny * (ay - cy)
+        return (-gap, -nx, -ny, s) if gap < 0.0 else (gap, nx, ny, s)
+    nx, ny = ax + s * ex - cx, ay + s * ey - cy
+    gap = max(math.sqrt(nx * nx + ny * ny), 1e-12)
+    return gap, nx / gap, ny / gap, s
 
 
-@compiled_inline
+@compiled_uncounted
 def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Shapes, rows: Vector) -> int:
-    """Write what the inner part of a segment sinks into: discs, and corners that stick out; return how many.
+    """Write what a segment sinks into: discs with its inner part, and corners that stick out; return how many.
 
     Against a disc of reach r, a chain of chords D that all touch the circle of radius (D / 2) / tan(D / 2 r) from
     outside turns as a thread of the same length on the disc does. That is the radius a segment keeps, less than
     r; its end points keep r. A segment on both sides of a corner's solid has a negative gap to the corner.
+    Beyond its ends a corner is as far from it as from its node: a corner that slides over a node meets no step in the
+    energy, at which Newton's iteration would not end.
 
     Args:
         q: state, shape (N,).
@@ -249,8 +309,8 @@ def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Sh
         length: D, of the segment at rest [m].
         radius: half the thread's diameter [m].
         shapes: the surface.
-        rows: gets place s from the first node, depth, gradient n_x, n_y there, and the gap, shape (k, 6); the first
-            column is left to the caller. What finds no row is left out.
+        rows: gets index a, place s from the first node, depth, gradient n_x, n_y there, and the gap, shape (k, 6); or,
+            of a corner beyond an end, what `point_contacts` has for the node. What finds no row is left out.
     """
     count, most = 0, rows.shape[0]
     ax, ay, bx, by = q[a], q[a + 1], q[a + 2], q[a + 3]
@@ -264,28 +324,40 @@ def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Sh
         reach *= max(half / math.tan(half), MIN_APOTHEM) if half < 1.5 else MIN_APOTHEM
         gap, nx, ny, s = _segment_gap(ax, ay, bx, by, shapes.discs[i, 0], shapes.discs[i, 1])
         if 0.0 < s < 1.0 and gap < reach and count < most:
-            rows[count, 1], rows[count, 2], rows[count, 3], rows[count, 4] = s, reach - gap, nx, ny
-            rows[count, 5] = gap
+            rows[count, 0], rows[count, 1], rows[count, 2] = a, s, reach - gap
+            rows[count, 3], rows[count, 4], rows[count, 5] = nx, ny, gap
             count += 1
     # A chord this deep behind a corner passes beside it, not over it.
     deepest = max(radius, 0.25 * size)
     ex, ey, square, corners = bx - ax, by - ay, size * size, shapes.corners
     for p in range(shapes.boxes.shape[0]):
-        box, reach = shapes.boxes[p], 0.5 * size + deepest
-        if not (box[0] - reach < mx < box[2] + reach and box[1] - reach < my < box[3] + reach):
+        reach, first = 0.5 * size + deepest, shapes.block_starts[p]
+        if _box_square(mx, my, shapes.boxes[p]) >= reach * reach:
             continue
-        for i in range(shapes.starts[p], shapes.starts[p + 1]):
-            dx, dy = corners[i, 0] - ax, corners[i, 1] - ay
-            # Most corners are beside the segment or far from its line, which takes no division to see.
-            if not 0.0 < dx * ex + dy * ey < square or abs(dx * ey - dy * ex) >= deepest * size:
+        for k in range(first, shapes.block_starts[p + 1]):
+            if _box_square(mx, my, shapes.blocks[k]) >= reach * reach:
                 continue
-            if shapes.convex[i] == 0.0 or count >= most:
-                continue
-            gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
-            if polygon_gap(ax + s * ex, ay + s * ey, shapes, p)[0] < 0.0:
-                gap, nx, ny = -gap, -nx, -ny
-            if gap < radius:
-                rows[count, 1], rows[count, 2], rows[count, 3], rows[count, 4] = s, radius - gap, nx, ny
-                rows[count, 5] = gap
-                count += 1
+            begin = shapes.starts[p] + BLOCK * (k - first)
+            for i in range(begin, min(begin + BLOCK, shapes.starts[p + 1])):
+                dx, dy = corners[i, 0] - ax, corners[i, 1] - ay
+                # Most corners are beside the segment or far from its line, which takes no division to see.
+                along, margin = dx * ex + dy * ey, radius * size
+                if not -margin < along < square + margin or abs(dx * ey - dy * ex) >= deepest * size:
+                    continue
+                if shapes.convex[i] == 0.0 or count >= most:
+                    continue
+                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
+                # Inside where it is to the left of both edges of the corner.
+                last = i - 1 if i > shapes.starts[p] else shapes.starts[p + 1] - 1
+                after = i + 1 if i + 1 < shapes.starts[p + 1] else shapes.starts[p]
+                ux, uy = corners[i, 0] - corners[last, 0], corners[i, 1] - corners[last, 1]
+                vx, vy = corners[after, 0] - corners[i, 0], corners[after, 1] - corners[i, 1]
+                if ux * ny - uy * nx > 0.0 and vx * ny - vy * nx > 0.0:
+                    gap, nx, ny = -gap, -nx, -ny
+                if gap < radius:
+                    rows[count, 0], rows[count, 1], rows[count, 2] = a, s, radius - gap
+                    rows[count, 3], rows[count, 4], rows[count, 5] = nx, ny, gap
+                    if s == 0.0 or s == 1.0:
+                        rows[count, 0], rows[count, 1], rows[count, 5] = a + 2.0 * s, -1.0, 1.0 / gap
+                    count += 1
     return count

@@ -7,7 +7,7 @@ needle's, so steps in turn would not be stable.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,9 +43,12 @@ __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
+MIN_PART = 1e-6  # of Newton's move, below which the line search ends
 MAX_ITERATIONS = 60  # of Newton in a step
 CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
 ROUNDING, MIN_ENERGY = 1e-10, 1e-18  # of the energy, a sum of larger terms; and J, of a move by the tolerance
+# Typed: a kernel is compiled again for each one that is written out.
+EXACT, CONVEX = cast(bool, np.bool_(False)), cast(bool, np.bool_(True))
 STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
 
 
@@ -125,6 +128,15 @@ def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System
 
 
 @compiled
+def _largest(values: Vector, lever: float) -> float:
+    """Return the greatest of a state's values, the first of them, which is of the heading, times a lever."""
+    largest = abs(values[0]) * lever
+    for value in values[1:]:
+        largest = max(largest, abs(value))
+    return float(largest)
+
+
+@compiled
 def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> tuple[int, float, float]:
     """Move a state to where a step's value is least.
 
@@ -148,44 +160,54 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
         np.empty((CONTACTS_PER_NODE * nodes, 6)),
     )
     gradient = system.gradient
-    scale = np.ones(size)  # of an angle as a way of the tip
-    scale[0] = math.sqrt(bodies.needle.tip[0] ** 2 + bodies.needle.tip[1] ** 2)
+    lever = math.sqrt(bodies.needle.tip[0] ** 2 + bodies.needle.tip[1] ** 2)  # of an angle as a way of the tip
     current, move = trial.copy(), np.inf
-    energy = _assemble_energy(trial, bodies, terms, system, driven, False)
-    force = float(np.max(np.abs(gradient / scale)))
+    energy = _assemble_energy(trial, bodies, terms, system, driven, EXACT)
+    force = _largest(gradient, 1.0 / lever)
     for iteration in range(1, MAX_ITERATIONS + 1):
         chol = system.band.copy()
         if not factor(chol):
-            _assemble_energy(current, bodies, terms, system, driven, True)
+            _assemble_energy(current, bodies, terms, system, driven, CONVEX)
             chol = system.band.copy()
             if not factor(chol):
                 return -1, np.inf, force
         step = -gradient
         back_substitute(chol, step)
         couple(chol, terms.pairs, system.second, 3 if driven else 0, step)
-        slope, move = float(np.dot(gradient, step)), float(np.max(np.abs(step * scale)))
-        if not move < np.inf:
-            return -1, move, force
-        part = 1.0
+        slope, move = float(np.dot(gradient, step)), _largest(step, lever)
+        if not max(abs(slope), move) < np.inf:
+            return -1, np.inf, force
+        # Between a place that is low enough and one that is not, until it is no more as steep as at the start: one that
+        # stopped short of a contact would meet it again, and stop a little nearer, without end.
+        low, high, part = 0.0, np.inf, 1.0
+        low_energy, low_slope, high_energy, high_slope = energy, slope, energy, slope
         while True:
             trial[:] = current + part * step
-            new = _assemble_energy(trial, bodies, terms, system, driven, False)
-            force = float(np.max(np.abs(gradient / scale)))
+            new = _assemble_energy(trial, bodies, terms, system, driven, EXACT)
+            force = _largest(gradient, 1.0 / lever)
             if move <= TOLERANCE:
                 return iteration, move, force
-            if new <= energy + 1e-4 * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
+            new_slope = float(np.dot(gradient, step))
+            if new > energy + 1e-4 * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
+                high, high_energy, high_slope = part, new, new_slope
+            elif new_slope < 0.9 * slope and MIN_PART < high - part < np.inf:
+                low, low_energy, low_slope = part, new, new_slope
+            else:
                 break
-            # The least of the cubic through the values and slopes at 0 and here (Nocedal and Wright, Numerical
-            # Optimization, equation 3.59), bounded: a new contact begins after a small part of a step.
-            new_slope, share = float(np.dot(gradient, step)), 1.0
-            middle = slope + new_slope - 3.0 * (new - energy) / part
-            square = middle * middle - slope * new_slope
+            width, share = high - low, 1.0
+            if width < MIN_PART:
+                if low == 0.0:
+                    return (iteration if move <= STALLED * TOLERANCE else -1), move, force
+                part = low
+                continue
+            # The least of the cubic through the values and slopes at both (Nocedal and Wright, Numerical Optimization,
+            # equation 3.59), bounded: a new contact begins after a small part of a step.
+            middle = low_slope + high_slope - 3.0 * (high_energy - low_energy) / width
+            square = middle * middle - low_slope * high_slope
             if square >= 0.0:
                 root = math.sqrt(square)
-                share = 1.0 - (new_slope + root - middle) / (new_slope - slope + 2.0 * root)
-            part *= min(max(share, 2e-3), 0.5)
-            if part < 1e-6:
-                return (iteration if move <= STALLED * TOLERANCE else -1), move, force
+                share = 1.0 - (high_slope + root - middle) / (high_slope - low_slope + 2.0 * root)
+            part = low + width * min(max(share, 2e-3), 0.5)
         current[:] = trial
         energy = new
     return (MAX_ITERATIONS if move <= STALLED * TOLERANCE else -1), move, force

@@ -209,10 +209,7 @@ def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
         ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
         reach = rod.radius + 0.75 * math.sqrt(ex * ex + ey * ey)
         if not clear(q[a] + 0.5 * ex, q[a + 1] + 0.5 * ey, reach, shapes):
-            found = segment_contacts(q, a, rod.segment, rod.radius, shapes, rows[count:])
-            for row in range(count, count + found):
-                rows[row, 0] = a
-            count += found
+            count += segment_contacts(q, a, rod.segment, rod.radius, shapes, rows[count:])
     return count
 
 
@@ -297,8 +294,9 @@ def add_friction(q: Vector, start: Vector, slip: float, friction: Vector, gradie
 @compiled
 def factor(band: Vector) -> bool:
     """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
+    width = band.shape[1]
     for i in range(band.shape[0]):
-        low = max(0, i - WIDTH + 1)
+        low = max(0, i - width + 1)
         for j in range(low, i + 1):
             total = band[i, i - j]
             for k in range(low, j):
@@ -315,15 +313,15 @@ def factor(band: Vector) -> bool:
 @compiled
 def back_substitute(band: Vector, right: Vector) -> None:
     """Solve in place with the factor that `factor` left."""
-    size = band.shape[0]
+    size, width = band.shape
     for i in range(size):
         total = right[i]
-        for j in range(max(0, i - WIDTH + 1), i):
+        for j in range(max(0, i - width + 1), i):
             total -= band[i, i - j] * right[j]
         right[i] = total / band[i, 0]
     for i in range(size - 1, -1, -1):
         total = right[i]
-        for j in range(i + 1, min(size, i + WIDTH)):
+        for j in range(i + 1, min(size, i + width)):
             total -= band[j, j - i] * right[j]
         right[i] = total / band[i, 0]
 
@@ -461,6 +459,10 @@ def add_pairs(
 def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: Vector) -> None:
     """Correct a step, found with the factor of the band alone, for the rows' second derivatives.
 
+        (S^-1 + W A^-1 W') f = W step,    step - A^-1 W' f
+
+    with the band's matrix A, the rows' derivatives W, and the second derivatives S that are not 0.
+
     Args:
         chol: the factor.
         pairs: of `find_pairs`.
@@ -468,23 +470,29 @@ def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: V
         first_free: the first unknown; those before are given.
         step: corrected, shape (N,).
     """
-    rows = np.flatnonzero(second > 0.0)
-    if len(rows) == 0:
-        return
-    size = len(rows)
-    columns, matrix, force = np.zeros((size, step.shape[0])), np.zeros((size, size)), np.zeros(size)
+    rows, size = np.empty(second.shape[0], np.int64), 0
+    for row in range(second.shape[0]):
+        if second[row] > 0.0:
+            rows[size] = row
+            size += 1
+    columns, force = np.zeros((size, step.shape[0])), np.zeros(size)
+    matrix = np.zeros((size, size))  # a band as wide as it is long
     for i in range(size):
         for r in range(6):
             at, weight = _place(pairs[rows[i]], r)
             if at >= first_free:
                 columns[i, at] += weight
+                force[i] += weight * step[at]
         back_substitute(chol, columns[i])
     for i in range(size):
-        matrix[i, i] = 1.0 / second[rows[i]]
+        matrix[i, 0] = 1.0 / second[rows[i]]
         for r in range(6):
             at, weight = _place(pairs[rows[i]], r)
             if at >= first_free:
-                force[i] += weight * step[at]
-                for j in range(size):
-                    matrix[i, j] += weight * columns[j, at]
-    step -= np.linalg.solve(matrix, force) @ columns
+                for j in range(i + 1):
+                    matrix[i, i - j] += weight * columns[j, at]
+    if size > 0 and factor(matrix):
+        back_substitute(matrix, force)
+        for i in range(size):
+            for at in range(step.shape[0]):
+                step[at] -= force[i] * columns[i, at]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
+from magnetosuture_thread.geometry.chords import find_chord_contacts
 from magnetosuture_thread.geometry.obstacles import Contacts, Disc, Obstacle, Polygon, Workspace
-from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
 from test.thread.scenes import east
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))

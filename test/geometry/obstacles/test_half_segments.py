@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
-from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distances
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace, half_segment_distances
 
 REACH = 5e-3
 WALL_RADIUS = 0.012

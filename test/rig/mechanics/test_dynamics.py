@@ -163,6 +163,18 @@ def test_the_wall_stops_the_needle(heading: float):
     assert np.hypot(*made.thread.T).max() < 17.5e-3
 
 
+def test_a_thread_pushed_into_a_corner_costs_no_more_than_a_free_one():
+    """A node is held by both edges of a corner, and Newton's iteration converges there in whole steps."""
+    trough = 1e-3 * np.array([(-3, -3), (3, -3), (3, 3), (2, 3), (2, -2), (-2, -2), (-2, 3), (-3, 3)])
+    start = 1e-3 * np.array([[0.0, 6.0], [1.9, -1.9]])
+    made = rig(replace(POLYAMIDE, length=8e-3, segments=30), surface=Surface(polygons=(trough,)), points=start)
+    for k in range(1, 121):
+        made.drive(start[0] - [0.0, 1e-3 * min(k / 30.0, 1.0)], 0.0, FRAME)
+        assert made.halvings == 0
+        assert made.iterations < 100
+    np.testing.assert_allclose(made.thread[-1], 1.97e-3 * np.array([1.0, -1.0]), atol=3e-6)
+
+
 @pytest.mark.parametrize("kind", ["disc", "square"])
 def test_the_thread_goes_round_an_obstacle(kind: str):
     square = 2e-3 * SQUARE

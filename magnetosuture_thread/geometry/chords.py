@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted, compiled_within
-from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, Contacts, WorkspaceData
+from magnetosuture_thread.geometry.obstacles import EDGE_WIDTH, Contacts, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = tuple[float, float, float]
