@@ -151,7 +151,7 @@ MADE: dict[str, tuple[Callable[..., Any], str]] = {
     "EstimatorSession": (made(EstimatorSession, estimator=3), "estimator"),
     "ForecastStart": (
         of_forecast,
-        "pose vertices velocities interval tip_velocity needle_force thread",
+        "pose vertices velocities interval tip_velocity needle_force",
     ),
     "Material": (MATERIAL, "diameter elastic_modulus stiffness_weight"),
     "Medium": (MEDIUM, " ".join(Medium.__dataclass_fields__)),

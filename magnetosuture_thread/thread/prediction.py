@@ -142,7 +142,11 @@ def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int =
     if not math.hypot(*tail) <= reach:
         expected = f"finite coordinates, at most {reach:g} m from the dish's centre"
         raise InvalidInputError("needle pose position", tail, expected + Quantity("", "m", -reach, reach).hint(tail))
-    if not (len(pose.deviation) == 2 and all(0.0 <= deviation < math.inf for deviation in pose.deviation)):
+    try:
+        deviations = [float(deviation) for deviation in pose.deviation]
+    except (TypeError, ValueError):
+        deviations = []
+    if len(deviations) != 2 or not all(0.0 <= deviation < math.inf for deviation in deviations):
         raise InvalidInputError("needle pose deviation", pose.deviation, "two finite numbers, not negative")
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")

@@ -119,7 +119,7 @@ LAB1 = ("-r", "__ns:=/lab1")
 REFUSED: list[tuple[str, str | None, tuple[str, ...], str]] = [  # program, parameter file, arguments, words
     ("thread_model", "thread_model: {ros__parameters: {segmens: 20}}", (), "thread_model.segmens: got 20"),
     ("coil_bridge", "coil_bridge: {ros__parameters: {max_speed: [oops}}", (), "expected valid YAML"),
-    ("coil_bridge", "coil_bridge: {ros__parameters: {rate: 50.0}}", LAB1, "got 'coil_bridge', expected one for"),
+    ("coil_bridge", "coil_bridge: {ros__parameters: {rate: 50.0}}", LAB1, "got '/coil_bridge', expected one for"),
     ("console", "console: {ros__parameters: {port: 0}}", LAB1, "expected one for /lab1/console: "),
     ("path_follower", None, LAB1, "parameter file: got 'No such file or directory', expected a readable YAML file"),
     ("perception", SETUP.format(tracker=0.018, model=18.0), (), "thread_model.thread_length: got 18.0, expected a"),
