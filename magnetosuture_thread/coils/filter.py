@@ -434,13 +434,13 @@ class NeedleSafetyFilter:
 
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
+        last = self._pose  # read once, as forecasts have the same filter in a thread of their own
+        if last is not None and last[0] == (*np.ravel(tail).tolist(), *np.ravel(heading).tolist()):
+            return last[1]
         # No dish is larger than 1 m.
         tail = finite_array("tail", tail, (2,), bounded("m", -1.0, 1.0))
         heading = finite_array("heading", heading, (2,), FINITE)
         key = (*tail.tolist(), *heading.tolist())
-        last = self._pose  # read once, as forecasts have the same filter in a thread of their own
-        if last is not None and last[0] == key:
-            return last[1]
         x, y, c, s = key
         size = math.hypot(c, s)
         if not size > 0.0:

@@ -35,16 +35,20 @@ def checked_arguments(owner: str, kind: Callable[..., Exception] = Configuration
     def decorate(target: Any) -> Any:
         function = vars(target)["__init__"] if isinstance(target, type) else target
         signature = inspect.signature(function)
-        hints = cache(lambda: get_type_hints(target, include_extras=True))  # later, when all names are known
+
+        @cache
+        def checkers() -> dict[str, Callable[[str, Any], Any]]:  # at the first call, when all names are known
+            hints = get_type_hints(target, include_extras=True).items()
+            return {name: check for name, hint in hints if (check := _checker(hint)) is not None}
 
         @wraps(function)
         def checked(*args: Any, **kwargs: Any) -> Any:
             bound = signature.bind(*args, **kwargs)
             try:
                 for name, value in bound.arguments.items():
-                    hint = hints().get(name)
-                    if hint is not None and (value is not None or signature.parameters[name].default is not None):
-                        bound.arguments[name] = _checked_argument(f"{owner}.{name}", value, hint)
+                    check = checkers().get(name)
+                    if check is not None and (value is not None or signature.parameters[name].default is not None):
+                        bound.arguments[name] = check(f"{owner}.{name}", value)
             except ConfigurationError as error:
                 raise kind(error.name, error.value, error.expectation) from None
             return function(*bound.args, **bound.kwargs)
@@ -57,22 +61,35 @@ def checked_arguments(owner: str, kind: Callable[..., Exception] = Configuration
     return decorate
 
 
-def _checked_argument(name: str, value: Any, hint: Any) -> Any:
-    """Return an argument as its annotation has it; what is neither class nor number is not, nor an array."""
+@cache
+def _checker(hint: Any) -> Callable[[str, Any], Any] | None:
+    """Return what checks an argument of an annotation; None for one that is neither class nor number, as an array."""
     hint, quantity = get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, Quantity(""))
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     lists = [kind for kind in kinds if {int, float} & {*get_args(kind)}]
     if lists or {int, float} & {*kinds}:
-        value = value.tolist() if hasattr(value, "tolist") else value
-        if lists and not (len(kinds) > 1 and isinstance(value, (int, float))):
-            return quantity.checked(name, value, tuple, get_args(lists[0])[0])
-        return quantity.checked(name, value, int if int in kinds else float)
-    classes = [Sequence if get_origin(kind) is tuple else get_origin(kind) or kind for kind in kinds]
-    if all(isinstance(kind, type) and not hasattr(kind, "__array__") for kind in classes):
-        if not isinstance(value, tuple(classes)) or (isinstance(value, str) and str not in classes):
+        kind, entry = int if int in kinds else float, get_args(lists[0])[0] if lists else float
+        may_be_number = not lists or len(kinds) > 1
+
+        def check_number(name: str, value: Any) -> Any:
+            value = value.tolist() if hasattr(value, "tolist") else value
+            if lists and not (may_be_number and isinstance(value, (int, float))):
+                return quantity.checked(name, value, tuple, entry)
+            return quantity.checked(name, value, kind)
+
+        return check_number
+    classes = tuple(Sequence if get_origin(kind) is tuple else get_origin(kind) or kind for kind in kinds)
+    if not all(isinstance(kind, type) and not hasattr(kind, "__array__") for kind in classes):
+        return None
+    entries = get_args(kinds[0])
+
+    def check_class(name: str, value: Any) -> Any:
+        if not isinstance(value, classes) or (isinstance(value, str) and str not in classes):
             words = [WORDS.get(kind, f"an instance of {kind.__name__}") for kind in classes]
             raise ConfigurationError(name, value, " or ".join(words))
-        if isinstance(value, (list, tuple)) and get_args(kinds[0]):
-            for index, entry in enumerate(value):
-                _checked_argument(f"{name}[{index}]", entry, get_args(kinds[0])[0])
-    return value
+        if entries and isinstance(value, (list, tuple)) and (check := _checker(entries[0])) is not None:
+            for index, item in enumerate(value):
+                check(f"{name}[{index}]", item)
+        return value
+
+    return check_class
