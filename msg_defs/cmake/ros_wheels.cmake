@@ -6,10 +6,12 @@
 #  - pip installs this project as one wheel, so the Python package's share/ is installed from here.
 
 find_package(Python3 REQUIRED COMPONENTS Interpreter)
+# pip builds in an environment of its own beside the one that it installs into, which may hold wheels without generators.
 execute_process(
   COMMAND ${Python3_EXECUTABLE} -c
-    "import importlib.util, pathlib as p; s = importlib.util.find_spec('ros_wheels_bootstrapper'); \
-print(p.Path(s.origin).resolve().parents[4] if s else '', end='')"
+    "import pathlib, sys; sites = [p for p in map(pathlib.Path, sys.path) if (p / 'ros_wheels_bootstrapper').is_dir()]; \
+prefixes = [p.resolve().parents[2] for p in sites]; \
+print(next((p for p in prefixes if (p / 'share/rosidl_default_generators').is_dir()), ''), end='')"
   OUTPUT_VARIABLE ros_wheels_prefix
   ERROR_QUIET
 )
