@@ -15,7 +15,6 @@ from magnetosuture_thread.thread.margins import (
     FrictionLaw,
     FrictionState,
     Margins,
-    NodeMotion,
 )
 
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=2e-4)
@@ -61,17 +60,3 @@ def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it(
     assert (close.clearance < 1e-3).any()
     disc = (-7e-3, 1.5e-3, 1e-3)
     assert LAW.classify(barriers(disc, others=(close,)), np.full(8, 1e-3)) == Friction(FrictionState.FREE, (), 1.0)
-
-
-def test_speeds_are_averaged():
-    motion, still = NodeMotion(0.2), np.zeros((3, 2))
-    np.testing.assert_array_equal(motion.update(still, 0.0), np.zeros(3))
-    moved, interval = still.copy(), 0.1
-    expected = 0.0
-    for k in range(1, 6):
-        moved = still + np.array([1e-4 * k, 0.0])
-        expected += (1.0 - np.exp(-0.5)) * (1e-3 - expected)
-        np.testing.assert_allclose(motion.update(moved, interval), np.full(3, expected), rtol=1e-12)
-    back = NodeMotion(0.2)
-    back.follow_on(motion)
-    np.testing.assert_allclose(back.update(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
