@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,15 +52,6 @@ def test_velocity_and_pose_of_a_needle_on_a_circle(seed: int):
     assert filtered[-1].deviation[0] < 0.8 * PLACE
     assert np.sqrt(np.mean(np.square(errors))) * filtered[-1].deviation[0] < 0.25e-3
     assert np.mean(turnings) == pytest.approx(SPEED / RADIUS, rel=0.03)
-
-
-def test_a_needle_that_stops_is_followed_at_once():
-    random, motion = np.random.default_rng(4), NeedleMotionFilter()
-    for k in range(240):
-        pose = motion.update(measured(replace(on_circle(min(k, 120) / RATE), stamp=k / RATE), random))
-        if k == 130:
-            assert pose.motion is not None
-            assert np.linalg.norm(pose.motion.velocity) < 0.2 * SPEED
 
 
 def test_the_pull_of_a_session_is_that_of_the_needle_and_not_of_noise():
