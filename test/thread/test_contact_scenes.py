@@ -1,4 +1,4 @@
-"""The thread among shapes that are hard on it, and among more of them than there is room for."""
+"""The thread at the wall, among shapes that are hard on it, and among more of them than there is room for."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from magnetosuture_thread.estimator.association import MeasuredPoints
 from magnetosuture_thread.estimator.correction import Corrector, Prior
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.scene import Dish
+from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
 from magnetosuture_thread.thread.rod import RodFormulation
-from test.thread.scenes import polyamide
+from test.thread.scenes import DT, east, followed, formulated, polyamide, straight
 
 RATE = 60.0
 DEPTH = 1.01e-7  # m; the tolerance to which a step ends
@@ -111,3 +112,23 @@ def test_more_contacts_than_there_is_room_for_are_refused_and_the_thread_stays_w
     points = MeasuredPoints(np.arange(1.0, 20.0), *np.full((2, 19), 1e-3), *np.ones((2, 19)))
     refused = Corrector(crowded, crowded.formulation).solve(prior, points)
     assert f"more than {CONTACTS_PER_NODE} contacts a node" in refused.problem
+
+
+RADIUS = 0.0175
+OUTSIDE = 1e-6  # m; farther outside of the dish no node may be
+
+
+@pytest.mark.parametrize("attachment", Attachment)
+@pytest.mark.parametrize("name", ["rod", "paper"])
+@pytest.mark.parametrize("speed", [0.005, 0.1])
+def test_a_thread_pushed_sideways_into_the_wall_slides_along_it(name: str, attachment: Attachment, speed: float):
+    thread = polyamide(attachment)
+    formulation = formulated(thread, name=name, wall=RADIUS)
+    begin = straight(thread) + np.array([0.004, 0.012])
+    steps = followed(formulation, begin, lambda k: begin[0] + min(k * speed * DT, 0.0045) * np.array([0.2, 1.0]), 100)
+    distance = max(float(np.linalg.norm(done.state.positions[1:], axis=1).max()) for done in steps)
+    assert -2e-5 < distance + 0.5 * thread.diameter - RADIUS < OUTSIDE
+    assert all(done.converged for done in steps)
+    wall = formulation.margins(steps[-1].state.positions, east())[-1]
+    assert wall.barrier == "wall"
+    assert wall.clearance[wall.node > 0].min() > -OUTSIDE
