@@ -12,9 +12,9 @@ import pytest
 import zstandard
 from rosbags.rosbag2 import Reader, StoragePlugin
 
-from magnetosuture_thread.bags.message_types import DecoderCache, typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import Budget, MessageDefinition
+from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
@@ -39,26 +39,19 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("bags") / "good")
 
 
-def test_what_is_written_is_read(good: Path):
+def test_what_is_written_is_read_also_by_another_tool(good: Path):
     for path in (good, good.parent):
         bag = Bag(path)
         assert bag.damage is None
         assert bag.topics == {"/one": HEADER, "/two": HEADER}
         assert bag.counts == {"/one": 200, "/two": 100}
         assert bag.start == 10**9
-        assert bag.duration == pytest.approx(2.99)
         assert bag.notes == {"setup": "example"}
         assert [record.decode().frame_id for record in bag.records()] == [f"frame {k}" for k in range(COUNT)]
         assert {record.topic for record in bag.records({"/two"})} == {"/two"}
-
-
-def test_another_tool_reads_it_whole(good: Path):
     with Reader(good.parent) as reader:
-        assert reader.message_count == COUNT
-        assert reader.duration == 2_990_000_001
-        connection = reader.connections[0]
-        assert connection.digest == typestore().hash_rihs01(HEADER)
-        assert connection.msgdef is not None
+        assert (reader.message_count, reader.duration) == (COUNT, 2_990_000_001)
+        assert reader.connections[0].digest == typestore().hash_rihs01(HEADER)
         assert sum(1 for _ in reader.messages()) == COUNT
 
 
@@ -81,11 +74,9 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
         ("hollow", None, "holds no messages"),
         ("two", None, "holds 2 .mcap files; name one of them"),
         ("pointer.mcap", LFS_POINTER, "is a pointer of Git LFS, not the file itself; fetch that by: git lfs pull"),
-        ("pointer.db3", LFS_POINTER, "is a pointer of Git LFS"),
         ("old.bag", b"#ROSBAG V2.0\n" * 9, "is a bag of ROS 1; convert it by: rosbags-convert --src FILE.bag"),
         ("ros1", None, "is a bag of ROS 1"),
         ("text.mcap", b"not a bag, but long enough to be one", "is no mcap file"),
-        ("empty.db3", b"", "is empty"),
         ("text.db3", b"text" * 99, "is no sqlite3"),
         ("broken.db3", broken, "is damaged"),
     ):
@@ -118,11 +109,7 @@ def test_bags_of_rosbag2_are_read(tmp_path: Path, plugin: StoragePlugin):
     assert (bag.topics, bag.counts) == (TYPES, {"/text": 200, "/header": 200})
     assert bag.damage is None
     assert "no checksums" in bag.has_no_checksum
-    assert [r.decode().data for r in bag.records({"/text"}, start=1.0, duration=0.02)] == [
-        "text 100",
-        "text 101",
-        "text 102",
-    ]
+    assert [r.decode().data for r in bag.records({"/text"}, start=1.0, duration=0.01)] == ["text 100", "text 101"]
     (folder / "metadata.yaml").unlink()
     assert read(Bag(folder)) == messages()
     file = next(path for path in folder.iterdir() if path.suffix in (".db3", ".mcap"))
@@ -178,41 +165,24 @@ def test_the_bags_own_definitions_are_taken(tmp_path: Path):
     """Of a type that we do not know, and of one that was different once."""
     theirs = MessageDefinition("their_msgs/msg/Thing", "ros2msg", "std_msgs/Header header\nint32 number\n")
     older = MessageDefinition(STRING, "ros2msg", "int32 size\nstring data\n")
+    idl = "module geometry_msgs { module msg { struct Point { float y; float x; float z; double w; }; }; };"
+    point = MessageDefinition("geometry_msgs/msg/Point", "ros2idl", idl)
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/thing", theirs.type_name, theirs)
         bag.add_topic("/older", STRING, older)
+        bag.add_topic("/point", point.type_name, point)
         bag.add_topic("/text", STRING)
         bag.write("/thing", 1, cdr(HEADER, stamped(3).stamp, "dis") + b"\7\0\0\0")
         bag.write("/older", 2, b"\0\1\0\0\5\0\0\0\2\0\0\0a\0")
         bag.write("/text", 3, cdr(STRING, "b"))
-    thing, old, text = (record.decode() for record in Bag(tmp_path / "bag").records())
+        bag.write("/point", 4, b"\0\1\0\0" + struct.pack("<3f4xd", 2.0, 1.0, 3.0, 4.0))
+    thing, old, text, place = (record.decode() for record in Bag(tmp_path / "bag").records())
     assert (thing.header.frame_id, thing.number) == ("dis", 7)
     assert (old.size, old.data, text.data) == (5, "a", "b")
+    assert (place.x, place.y, place.z, place.w) == (1.0, 2.0, 3.0, 4.0)
 
 
-POINT = "geometry_msgs/msg/Point"
-
-
-@pytest.mark.parametrize(
-    ("fields", "is_ours"),
-    [("double x; double y; double z;", True), ("float y; float x; float z; double w;", False)],
-)
-def test_definitions_in_idl_are_taken(fields: str, is_ours: bool):
-    """Ours is not used in the place of one that differs."""
-    text = f"module geometry_msgs {{ module msg {{ struct Point {{ {fields} }}; }}; }};"
-    decoder = DecoderCache(Budget("bag", 0)).decoder_of(MessageDefinition(POINT, "ros2idl", text))
-    assert decoder.is_ours == is_ours
-    if is_ours:
-        point = decoder.decode("/point", b"\0\1\0\0" + struct.pack("<3d", 1.0, 2.0, 3.0))
-    else:
-        point = decoder.decode("/point", b"\0\1\0\0" + struct.pack("<3f4xd", 2.0, 1.0, 3.0, 4.0))
-        assert point.w == 4.0
-    assert (point.x, point.y, point.z) == (1.0, 2.0, 3.0)
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"\0\1\0\0\xff\xff\xff\x7fabc\0", b"\0\1\0\0\2\0\0\0\xff\0", b"\x28\xb5\x2f\xfd\0\0"]
-)
+@pytest.mark.parametrize("data", [b"", b"\0\1\0\0\xff\xff\xff\x7fabc\0", b"\x28\xb5\x2f\xfd\0\0"])
 def test_bytes_that_are_no_message_name_the_topic(tmp_path: Path, data: bytes):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/text", STRING)

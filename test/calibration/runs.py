@@ -60,9 +60,9 @@ def rig_run(ratio: float, duration: float = 6.0, phase: float = 0.0, clamped: bo
     return tuple(found)
 
 
-def noisy(sights: tuple[Observation, ...], noise: float, seed: int = 1) -> Iterator[Observation]:
+def noisy(sights: tuple[Observation, ...], noise: float) -> Iterator[Observation]:
     """Give sights as a camera with such a noise would [m]; of the heading it is a seventh of a millimetre's."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     for sight in sights:
         tail = sight.tail + noise * rng.standard_normal(2)
         turn = noise / 7e-3 * rng.standard_normal()
@@ -88,12 +88,10 @@ def model_run(
     return tuple(found)
 
 
-def rig_passage(
-    ratio: float, noise: float = 0.0, phase: float = 0.0, clamped: bool = False, name: str = "run"
-) -> RecordedRun:
+def rig_passage(ratio: float, noise: float = 0.0, clamped: bool = False) -> RecordedRun:
     """Return a run of the rig as a passage."""
-    sights = rig_run(ratio, phase=phase, clamped=clamped)
-    return read_run(name, noisy(sights, noise) if noise else sights, SETTINGS)
+    sights = rig_run(ratio, clamped=clamped)
+    return read_run("run", noisy(sights, noise) if noise else sights, SETTINGS)
 
 
 def stiff(ratio: float, settings: ThreadModelSettings = SETTINGS) -> ThreadModelSettings:

@@ -1,15 +1,30 @@
-"""A calibration finds what was put in, and says what cannot be found."""
+"""A calibration finds what was put in, and says what cannot be identified."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from magnetosuture_thread.calibration.parameters import stiffness_over_drag
+from magnetosuture_thread.calibration.parameters import (
+    DRAG_ANISOTROPY,
+    OF_FORMULATION,
+    REST_CURVATURE,
+    STIFFNESS_OVER_DRAG,
+    stiffness_over_drag,
+)
 from magnetosuture_thread.calibration.recorded_run import read_run
-from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, STAND_IN, CalibrationResult, Estimate
-from magnetosuture_thread.calibration.search import calibrate
+from magnetosuture_thread.calibration.result import (
+    FIXED,
+    IDENTIFIED,
+    STAND_IN,
+    CalibrationResult,
+    Estimate,
+    to_yaml,
+)
+from magnetosuture_thread.calibration.search import FitSolution, assess_identifiability, calibrate
 from test.calibration.runs import SETTINGS, SILK, model_run, noisy, rig_passage, rig_run, stiff
 
 TRUE = 1.3e-9  # m^4/s
@@ -67,6 +82,7 @@ def test_of_silk_the_stiffness_cannot_be_told(scale, period, factor, noise, stat
     stiffness = of(found, "stiffness over drag")
     assert stiffness.status == status
     assert "elsewhere it goes where it is pulled" in stiffness.reason
+    assert ("\n    elastic_modulus: " in to_yaml(found)) == (status != FIXED)
     assert any(words in warning for warning in found.warnings)
     if status == FIXED:
         assert found.settings.elastic_modulus == pytest.approx(start.elastic_modulus)
@@ -79,3 +95,44 @@ def test_the_paper_s_numbers_are_fitted_too():
     found, _ = calibrate([read_run("run", rig_run(TRUE, 4.5), settings)], settings, ["paper_damping"])
     assert [estimate.setting for estimate in found.estimates] == ["paper_damping"]
     assert found.scores[0].after < found.scores[0].before - 1.0
+
+
+X = DRAG_ANISOTROPY.to_fit(0.5), 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "stiffness", "index", "reason"),
+    [
+        ("alike", 1.3e-9, 1, "cannot be told apart from stiffness over drag: correlation -0.99"),
+        ("weak", 1.3e-9, 1, "a factor of two moves the prediction by 0.1"),
+        ("", 2e-12, 0, "bending acts within 0.7 mm, 3."),
+    ],
+)
+def test_what_cannot_be_identified_is_named_with_the_reason(change: str, stiffness: float, index: int, reason: str):
+    run, random = rig_passage(1.3e-9), np.random.default_rng(1)
+    jacobian = 0.1 * random.standard_normal((*run.known.shape, 3))
+    if change == "alike":
+        jacobian[..., 1] = 0.5 * jacobian[..., 0] + 0.005 * random.standard_normal(run.known.shape)
+    elif change == "weak":
+        jacobian[..., 1] *= 0.02
+    parameters, x = (STIFFNESS_OVER_DRAG, DRAG_ANISOTROPY, REST_CURVATURE), np.array([math.log(stiffness), *X])
+    residuals = 1e-4 * random.standard_normal(run.known.shape)
+    solution = FitSolution(SETTINGS, parameters, x, [residuals], [jacobian], math.inf, 0.0)
+    reasons = [each.reason for each in assess_identifiability(solution, [run])]
+    assert reason in reasons.pop(index)
+    assert reasons == ["", ""]
+
+
+ALL = [(formulation, parameter) for formulation, many in OF_FORMULATION.items() for parameter in many]
+
+
+@pytest.mark.parametrize(("formulation", "parameter"), ALL, ids=[parameter.name for _, parameter in ALL])
+def test_a_number_goes_in_and_comes_out(formulation, parameter):
+    settings = replace(SETTINGS, formulation=formulation)
+    low, high = parameter.fit_bounds(settings)
+    assert low < parameter.to_fit(parameter.read(settings)) <= high
+    for part in (0.001, 0.3, 0.999):
+        value = parameter.from_fit(low + part * (high - low))
+        assert parameter.read(parameter.write(settings, value)) == pytest.approx(value, rel=1e-9, abs=1e-15)
+    lower, upper = parameter.interval(parameter.to_fit(parameter.read(settings)), 1e-6)
+    assert lower < parameter.read(settings) < upper

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.estimator import EstimatorOptions, ThreadEstimator
+from magnetosuture_thread.estimator import ThreadEstimator
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -27,14 +27,12 @@ def thread_of(
     return Thread.of(MATERIALS[material], length=LENGTH, segments=segments, attachment=kind, viscosity=viscosity)
 
 
-def predictor_of(thread: Thread, discs: tuple[Disc, ...] = (), wall: float = math.inf) -> ThreadPredictor:
-    return ThreadPredictor(thread, Workspace(discs, 5e-3, wall_radius=wall))
+def predictor_of(thread: Thread, discs: tuple[Disc, ...] = ()) -> ThreadPredictor:
+    return ThreadPredictor(thread, Workspace(discs, 5e-3))
 
 
-def estimator_of(
-    thread: Thread, discs: tuple[Disc, ...] = (), wall: float = math.inf, options: EstimatorOptions | None = None
-) -> ThreadEstimator:
-    return ThreadEstimator(predictor_of(thread, discs, wall), options)
+def estimator_of(thread: Thread, discs: tuple[Disc, ...] = ()) -> ThreadEstimator:
+    return ThreadEstimator(predictor_of(thread, discs))
 
 
 def poses(count: int, speed: float = 2e-3, turn: float = 0.6) -> list[NeedlePose]:

@@ -1,35 +1,31 @@
-"""Errors of predictions, the figures of a run, and what is kept of it: columns, worst frames, error map."""
+"""Errors of predictions and estimates, the figures of a run, and what is kept of it."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from magnetosuture_thread.evaluation.frames import ErrorMap, EstimatedThread, FrameResult, Observation, with_gaps
+from magnetosuture_thread.estimator import Disturbance
+from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import (
+    Consistency,
+    HiddenShares,
     RunMetrics,
     SensorSilence,
-    node_errors,
+    mean_band,
     prediction_error_percent,
-    target_points,
 )
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import Prediction
-from test.evaluation.runs import both, margins
+from test.evaluation.runs import margins
 
 NODES = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
 STRAIGHT = np.column_stack([-0.125 * np.arange(9), np.zeros(9)])
 LINE = np.column_stack([-np.linspace(0.0, 1.0, 9), np.zeros(9)])
-
-
-def test_a_barrier_of_a_user_has_a_column_and_a_minimum_like_the_others():
-    run = RunMetrics(1.0)
-    for k, clearance in enumerate((0.5, -0.1, 0.2)):  # it comes while the run goes on
-        given = both(margins(1.0), margins(clearance, "tip_keep_in")) if k else margins(1.0)
-        run.add(FrameResult(k, vertices=STRAIGHT, margins=given))
-    assert run.series.column("margin_tip_keep_in") == pytest.approx([np.nan, -0.1, 0.2], nan_ok=True)
-    assert list(run.minimum_margins) == ["obstacle", "tip_keep_in"]
-    assert run.minimum_margins["tip_keep_in"].clearance == -0.1
 
 
 def test_a_minimum_margin_is_of_one_row_and_the_deepest_chord_of_all():
@@ -78,8 +74,6 @@ def test_the_error_is_of_the_nodes_that_are_known_and_none_of_less_than_half():
     assert prediction_error_percent(moved, curve[:76], 1.0) == pytest.approx(2.0)
     for short in (curve[:0], curve[:1], curve[:41]):
         assert np.isnan(prediction_error_percent(NODES, short, 1.0))
-    targets, _ = target_points(0.9995 * NODES, 1.0, 10)  # chords of a curve are a little short
-    assert np.isfinite(node_errors(NODES, targets, 1.0)).all()
 
 
 @pytest.mark.parametrize(
@@ -91,9 +85,7 @@ def test_the_error_is_of_the_nodes_that_are_known_and_none_of_less_than_half():
             SensorSilence(1, 240.1, 240.1, 59.9),
         ),
         (np.arange(100.0, 200.0, 0.1), SensorSilence(2, 260.1, 160.1, 199.9)),
-        (np.arange(0.0, 100.0, 0.1) + 1e9, SensorSilence()),  # of another clock
         (np.concatenate([np.arange(0.0, 360.0, 0.1), [-1.7e9]]), SensorSilence()),  # a frame stamped 0
-        (np.array([3.0]), SensorSilence(1, 360.0, 360.0, 0.0)),
     ],
 )
 def test_the_silence_of_a_sensor_is_counted(times: np.ndarray, expected: SensorSilence):
@@ -103,36 +95,68 @@ def test_the_silence_of_a_sensor_is_counted(times: np.ndarray, expected: SensorS
     assert found.at == pytest.approx(expected.at, abs=0.2, nan_ok=True)
 
 
-def test_a_line_is_broken_where_nothing_came():
-    times = np.concatenate([np.arange(10) / 30.0, 5.0 + np.arange(10) / 30.0])
-    at, values = with_gaps(times, np.ones(20))
-    assert (len(at), int(np.isnan(values).sum())) == (22, 2)
-    assert at[10:12] == pytest.approx([10 / 30.0, 5.0 - 1 / 30.0])
-
-
-@pytest.mark.parametrize("frames", [1, 8, 9, 4096])
-def test_the_map_stays_small_and_keeps_the_greatest_errors(frames: int):
-    gathered = ErrorMap(0.019, columns=4)
-    values = np.random.default_rng(frames).random((frames, 3))
-    for index, errors in enumerate(values):
-        gathered.add(index / 30.0, errors)
-    grid = gathered.grid()
-    assert grid is not None
-    times, lengths, found = grid
-    assert found.shape[1] == len(times) <= 8
-    assert found.max(axis=1).tolist() == values.max(axis=0).tolist()
-    assert lengths[-1] == 0.019
-
-
-@pytest.mark.parametrize("nodes", [np.array([[0.0, 0.0], [0.01, np.nan], [0.02, 0.0]]), np.zeros((1, 2))])
-def test_a_prediction_with_a_node_that_is_nowhere_has_no_error(nodes: np.ndarray):
-    curve = np.column_stack([np.linspace(0.0, 0.02, 50), np.zeros(50)])
-    assert np.isnan(prediction_error_percent(nodes, curve, 0.02))
-
-
 def test_an_estimate_is_measured_beside_a_prediction_that_is_nowhere():
     run, nowhere = RunMetrics(1.0), STRAIGHT.copy()
     nowhere[3] = np.nan
     run.add(FrameResult(0, vertices=nowhere, ground_truth=LINE, estimate=EstimatedThread(STRAIGHT)))
     assert not len(run.series.known("error_truth"))
     assert run.series.known("estimate_error_truth") == pytest.approx([0.0])
+
+
+UP = np.array([0.0, 1.0])
+
+
+def frame(stamp: float, estimate: EstimatedThread | None, **others: Any) -> FrameResult:
+    """Return a frame whose prediction is 0.02 m off."""
+    return FrameResult(round(stamp * 1e9), vertices=STRAIGHT + 0.02 * UP, estimate=estimate, **others)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.5])
+def test_innovations_are_within_their_band_if_they_are_as_expected(scale: float):
+    squared = scale * np.random.default_rng(1).standard_normal((2000, 16)) ** 2
+    squared[::3, 5:] = np.nan  # hidden
+    run = RunMetrics(1.0)
+    for k, row in enumerate(squared):
+        run.add(frame(0.1 * k, EstimatedThread(STRAIGHT, True, row)))
+    found = Consistency.of(run.series)
+    assert found is not None
+    assert found.windows == 40
+    assert found.width == pytest.approx(199.9 / 40)
+    assert found.mean == pytest.approx(np.nanmean(squared), rel=1e-9)
+    if scale == 1.0:
+        assert found.within >= 34
+    else:
+        assert found.within == 0
+        assert (found.means > found.high).all()
+    counts = np.array([16.0, 2400.0])
+    for count, low, high in zip(counts, *mean_band(counts), strict=True):
+        assert chi2.cdf((low * count, high * count), count) == pytest.approx((0.025, 0.975))
+
+
+def test_hidden_shares_are_of_time_and_not_of_frames():
+    run = RunMetrics(1.0)
+    for time in [*np.arange(0.0, 1.0, 0.1), *np.arange(1.0, 2.0, 0.05)]:
+        run.add(frame(time, EstimatedThread(STRAIGHT, time < 1.5), measured=LINE[:5] if time < 1.0 else LINE))
+    found = HiddenShares.of(run.series)
+    assert found is not None
+    assert (found.time, found.all_time, found.length) == pytest.approx((0.75, 0.25, 0.5), abs=0.02)
+
+
+def test_disturbances_of_one_beginning_are_one_event():
+    run = RunMetrics(1.0, 10**10)
+    place = np.array([0.1, 0.2])
+    for time, since, significance in (
+        (10.0, None, 0.0),
+        (10.5, 10.4, 5.0),
+        (10.6, 10.4, 7.0),
+        (10.7, 10.4, 6.0),
+        (10.8, None, 0.0),
+        (10.9, 10.85, 5.0),
+    ):
+        found = (Disturbance(0.3 * significance, 0.1, place, UP, 1e-6, significance, since),) if since else ()
+        run.add(frame(time, EstimatedThread(STRAIGHT, True, np.empty(0), found)))
+    first, second = run.disturbances
+    assert [first.begin_s, first.end_s] == pytest.approx([0.4, 0.7])
+    assert [first.significance, first.arc_length_m] == pytest.approx([7.0, 2.1])
+    assert [first.x_m, first.y_m, first.direction_rad] == pytest.approx([0.1, 0.2, math.pi / 2])
+    assert second.begin_s == pytest.approx(0.85)

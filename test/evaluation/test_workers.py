@@ -52,21 +52,13 @@ def test_a_process_that_dies_takes_only_its_own_task_with_it(work: Any):
     assert dict(os.environ) == before
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_what_ends_the_call_ends_the_processes(work: Any, workers: int):
+def test_what_ends_the_call_ends_the_processes(work: Any):
     def interrupt(text: str) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), TaskRunner(work, workers) as runner:
+    with pytest.raises(KeyboardInterrupt), TaskRunner(work, 3) as runner:
         list(runner.run([1, 2, 4], interrupt))
     assert not multiprocessing.active_children()
-
-
-def test_one_task_needs_no_process_of_its_own(work: Any):
-    shares: list[float] = []
-    with TaskRunner(work, 8) as runner:
-        ((index, (square, process, _)),) = runner.run([2], progress=shares.append)
-    assert (index, square, process, shares) == (0, 4, os.getpid(), [0.5, 1.0])
 
 
 def test_processes_serve_again_and_an_error_of_this_package_is_raised_as_it_is(work: Any):

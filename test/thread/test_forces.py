@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 
 RATE = 66.0
 
@@ -52,23 +50,6 @@ def test_a_clamped_thread_in_a_cross_flow_turns_the_needle_as_a_beam_does(side: 
         forces = predictor.step(pose(20.0 * k, (0.0, 0.0), (1.0, 0.0))).forces
     assert forces is not None
     assert forces.needle_moment == pytest.approx(-0.5 * side * load * thread.length**2, rel=0.02)
-
-
-def test_a_hanging_chain_has_the_tension_of_a_catenary():
-    mass, gravity, length, span, segments = 1e-5, 9.81, 0.1, 0.08, 80
-    medium = Medium.air(mass, (0.0, -gravity), drag=2e-4)
-    thread = Thread("chain", length, segments, 1e-4, 0.0, medium, Attachment.PINNED)
-    scale = brentq(lambda a: 2.0 * a * math.sinh(span / (2.0 * a)) - length, 0.01, 1.0)
-    at = np.linspace(-length / 2, length / 2, segments + 1)
-    nodes = np.column_stack([scale * np.arcsinh(at / scale), np.hypot(scale, at)])
-    predictor = ThreadPredictor(thread, fixed_nodes=[segments])
-    predictor.start_at(pose(0.0, nodes[0], (-1.0, 0.0)), nodes)
-    for k in range(1, 400):
-        forces = predictor.step(pose(0.02 * k, nodes[0], (-1.0, 0.0))).forces
-    assert forces is not None
-    middles = 0.5 * (at[1:] + at[:-1])
-    assert forces.tension == pytest.approx(mass * gravity * np.hypot(scale, middles), rel=1e-3)
-    assert forces.needle_force == pytest.approx(mass * gravity * np.array([scale, -length / 2]), rel=2e-3)
 
 
 def test_contact_drag_and_needle_are_in_balance():

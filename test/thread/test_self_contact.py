@@ -65,36 +65,6 @@ def test_the_rows_are_the_distances_of_nodes_from_segments():
                 assert again.value[same] - rows.value[row] == pytest.approx(slope, abs=1e-13)
 
 
-def test_a_node_that_passed_through_a_segment_is_on_its_wrong_side():
-    thread = soft(6, 0.006)
-    before = 1e-3 * np.array([(0, 0), (1, 0), (2, 0), (2.5, 0.8), (1.8, 1.4), (1.2, 0.8), (0.5, 0.2)], dtype=float)
-    after = before.copy()
-    after[6] = 1e-3 * np.array([0.5, -0.3])
-    around = before.copy()
-    around[6] = 1e-3 * np.array([-0.5, -0.1])
-    barrier = SelfContact(thread)
-    assert barrier.passed(before, after)
-    rows = barrier.rows_after(before, after)
-    row = int(np.flatnonzero((rows.nodes == (0, 1, 6)).all(axis=1))[0])
-    assert rows.value[row] == pytest.approx(-0.3e-3 - DIAMETER)
-    np.testing.assert_allclose(rows.gradient[row], [(0.0, -0.5), (0.0, -0.5), (0.0, 1.0)], atol=1e-12)
-    assert not barrier.passed(before, around)
-    assert (barrier.rows_after(before, around).value > 0.0).all()
-
-
-def test_a_node_that_passes_through_a_segment_and_back_has_passed():
-    """Node 4 enters the segment that turns about node 0 at 0.28 of the way and leaves it at 0.72."""
-    before = 1e-3 * np.array([(0.0, 0.0), (1.0, 0.0), (1.6, 0.8), (1.0, 1.5), (0.5, 0.1)])
-    after = before.copy()
-    after[1], after[4] = (1e-3, 1e-3), (0.0, 1e-4)
-    barrier = SelfContact(soft(4, 4e-3))
-    assert not barrier.crossings(before)
-    assert not barrier.crossings(after)
-    assert barrier.crossings(0.5 * (before + after))
-    assert barrier.passed(before, after)
-    assert (barrier.rows_after(before, after).value > 0.0).all()
-
-
 @pytest.mark.parametrize(("seed", "steps"), [(0, 200), (1, 200), (92, 300), (106, 300)])
 def test_no_random_motion_takes_a_thread_through_itself(seed: int, steps: int):
     """`python -m benchmarks contact` does a thousand of them."""

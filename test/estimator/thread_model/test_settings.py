@@ -1,15 +1,17 @@
-"""Settings of the thread model: what they make, and what they refuse."""
+"""Settings of the thread model: what they make, what they refuse, and what a material changes."""
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.settings.configuration import from_mapping
+from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
 from test.thread.worlds import polygon, scene_with
@@ -49,11 +51,10 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
     "values",
     [
         {},
-        {"formulation": "paper"},
+        {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
         {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
         {"fixed_nodes": [20], "rest_curvature": 30.0, "attachment_offset": [1e-3, 5e-4], "flow": [1e-3, -2e-3]},
         {"solver": "osqp", "attachment": "clamped", "drag_anisotropy": 1.0, "margin_range": 0.02},
-        {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
     ],
 )
 def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
@@ -87,3 +88,31 @@ def test_the_attachments_velocity_is_the_rate_of_its_place():
     motion = after(0.0).motion
     assert motion is not None
     np.testing.assert_allclose(motion.velocity, (after(step).tail - after(-step).tail) / (2.0 * step), rtol=1e-6)
+
+
+def changed(values: dict[str, Any], **before: Any) -> ThreadModelSettings:
+    """Return the settings after a change."""
+    return from_mapping(ThreadModelSettings, {**to_mapping(from_mapping(ThreadModelSettings, before)), **values})
+
+
+def material(**fields: Any) -> dict[str, Any]:
+    """Return the settings that a ThreadMaterial with these fields changes."""
+    empty = {"name": "", "rest_curvature": (), "attachment": "", "attachment_offset": ()}
+    numbers = dict.fromkeys(("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"), 0.0)
+    return parse_material(SimpleNamespace(**{**empty, **numbers, **fields}))
+
+
+def test_a_material_that_is_named_brings_its_own_figures():
+    before = {"diameter": 7e-5, "elastic_modulus": 1e9, "paper_stiffness_weight": 3.0, "viscosity": 0.7}
+    silk = changed(material(name="silk_6_0"), **before)
+    assert silk == from_mapping(ThreadModelSettings, {"material": "silk_6_0", "viscosity": 0.7})
+    thicker = changed(material(name="silk_6_0", diameter=9e-5), **before)
+    assert (thicker.material, thicker.diameter, thicker.elastic_modulus) == ("silk_6_0", 9e-5, 0.0)
+
+
+def test_what_may_be_zero_can_be_told_and_what_is_not_told_stays():
+    nothing = dict.fromkeys(("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"), math.nan)
+    assert material() == material(**nothing) == {}
+    before = {"rest_curvature": 5.0, "attachment_offset": [1e-3, 0.0], "attachment": "clamped"}
+    told = material(rest_curvature=[0.0], attachment_offset=[0.0, 0.0], attachment="pinned")
+    assert changed(told, **before) == from_mapping(ThreadModelSettings, {"attachment_offset": [0.0, 0.0]})
