@@ -124,6 +124,7 @@ def test_by_markers_a_tilted_camera_is_straightened_and_the_needle_is_where_it_i
     file = tmp_path / "camera.yaml"
     file.write_text(found.to_yaml())
     settings = load_setup(file, (VisionTrackerSettings,))["vision_tracker"]
+    assert found.homography is not None
     np.testing.assert_allclose(settings.homography(), found.homography, rtol=1e-9)
     pose = Pose(np.array([0.009, -0.006]), 0.8)
     seen = VisionTracker(settings, SCENE).look(taken(render(pose)))
