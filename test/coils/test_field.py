@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
-from magnetosuture_thread.settings.errors import ConfigurationError
 
 DISTANCE, RADIUS, FIELD = 0.05, 0.025, 1.2e-3
 
@@ -44,17 +43,3 @@ def test_the_field_at_the_centre_is_each_coils_own_and_points_away_where_it_is_n
     for coil, found in zip(UNLIKE, field.T, strict=True):
         expected = coil.field_per_current * np.array([np.cos(coil.angle), np.sin(coil.angle)])
         np.testing.assert_allclose(found, expected, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"distance": 50.0}, r"coil\.distance: got 50\.0, expected a number from 0\.01 to 1 m"),
-        ({"field_per_current": 0.0}, "at least 1e-06 T/A"),
-        ({"radius": float("nan")}, "radius"),
-        ({"name": " "}, "a name"),
-    ],
-)
-def test_a_coil_that_cannot_be_is_refused(change: dict, words: str):
-    with pytest.raises(ConfigurationError, match=words):
-        CoilProperties(**{"name": "east", **change})

@@ -38,9 +38,7 @@ def test_of_a_tilted_needle_the_heading_is_that_of_its_projection(size: float):
     ("quaternion", "words"),
     [
         ((0.0, 0.0, 0.0, 0.0), "norm 0"),
-        ((0.0, 0.0, 0.0, float("nan")), "norm nan"),
         ((0.0, 0.0, 0.0, 1.002), "norm 1.002"),
-        ((0.0, 0.0, 0.998, 0.0), "norm 0.998"),
         ((1e300, 0.0, 0.0, 1e300), "expected a unit quaternion"),
         ((0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), "upright"),
     ],

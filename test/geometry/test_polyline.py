@@ -16,11 +16,6 @@ def test_arc_lengths_and_points_of_a_corner():
     assert points_at(corner, np.array([-1.0, 2.5, 9.0])).tolist() == [[0.0, 0.0], [2.0, 0.5], [2.0, 1.0]]
 
 
-def test_a_chain_past_the_end_goes_on_straight():
-    chain = chain_along(np.array([[0.0, 0.0], [1.0, 0.0]]), 5, 0.5)
-    np.testing.assert_allclose(chain, np.column_stack([0.5 * np.arange(6), np.zeros(6)]), atol=1e-12)
-
-
 @given(
     steps=st.lists(st.tuples(st.floats(0.05, 1.0), st.floats(-1.2, 1.2)), min_size=1, max_size=30),
     segments=st.integers(1, 40),

@@ -21,35 +21,25 @@ def follower(**changes: Any) -> PathFollower:
     return settings.follower()
 
 
-def run(
-    controller: PathFollower, drift: np.ndarray, seconds: float = 30.0, first: int = 0
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Move a tip by the commanded velocity and a drift; return distances from the setpoint, speeds and progress."""
+def run(controller: PathFollower, drift: np.ndarray, first: int = 0) -> tuple[np.ndarray, float]:
+    """Move a tip by the commanded velocity and a drift; return distances from the setpoint and progress."""
     tip = LENGTH * EAST
-    apart, speeds = [], []
+    apart = []
     command = controller.compute_command(first / RATE, tip - LENGTH * EAST, EAST)
-    for step in range(first + 1, first + int(seconds * RATE)):
+    for step in range(first + 1, first + int(30.0 * RATE)):
         tip = tip + (command.velocity + drift * np.any(command.velocity)) / RATE
         command = controller.compute_command(step / RATE, tip - LENGTH * EAST, EAST)
         apart.append(np.linalg.norm(command.tip - tip))
-        speeds.append(np.linalg.norm(command.velocity))
         if command.progress >= 1.0:
             break
-    return np.array(apart), np.array(speeds), command.progress
-
-
-def test_ideal_needle_follows_the_whole_path():
-    apart, speeds, progress = run(follower(), np.zeros(2))
-    assert progress == 1.0
-    assert apart.max() < 1.5e-4
-    assert np.median(speeds) == pytest.approx(0.005, rel=0.05)
+    return np.array(apart), command.progress
 
 
 def test_integral_term_compensates_a_constant_drift():
     """A proportional law alone would stay behind by drift / gain, here 0.125 mm."""
     drift = np.array([0.0, 0.001])
-    with_integral, _, _ = run(follower(), drift)
-    without, _, _ = run(follower(integral_gain=0.0), drift)
+    with_integral, _ = run(follower(), drift)
+    without, _ = run(follower(integral_gain=0.0), drift)
     settled = slice(150, 240)
     assert np.median(without[settled]) > 1.0e-4
     assert np.median(with_integral[settled]) < 0.5 * np.median(without[settled])
@@ -73,32 +63,15 @@ def test_setpoint_waits_for_a_blocked_needle_and_the_command_stays_bounded():
         command = controller.compute_command(step / RATE, np.zeros(2), EAST)
     assert np.linalg.norm(command.tip - LENGTH * EAST) < 0.0012
     assert np.linalg.norm(command.velocity) < 0.014
-    apart, _, progress = run(controller, np.zeros(2), first=600)
+    apart, progress = run(controller, np.zeros(2), first=600)
     assert progress == 1.0
     assert np.median(apart) < 1.5e-4
-
-
-def test_curved_needle_is_controlled_at_its_tip():
-    controller = follower(needle_curvature=150.0)
-    command = controller.compute_command(0.0, np.zeros(2), EAST)
-    angle = 150.0 * LENGTH
-    np.testing.assert_allclose(command.tip, [np.sin(angle) / 150.0, (1.0 - np.cos(angle)) / 150.0], atol=1e-9)
 
 
 CORNERS = np.array([[0.0, 0.0], [0.01, 0.002], [0.012, 0.01], [0.0, 0.012]])
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        np.zeros((1, 2)),
-        np.zeros((2, 2)),
-        np.array([[0.0, 0.0], [np.nan, 1.0]]),
-        CORNERS[[0, 1, 1, 2]],
-        CORNERS[[0, 1, 1]] + [[0.0, 0.0], [0.0, 0.0], [0.0, 4e-19]],
-    ],
-    ids=["one point", "no way", "not finite", "twice the same", "almost the same"],
-)
+@pytest.mark.parametrize("points", [np.zeros((1, 2)), np.array([[0.0, 0.0], [np.nan, 1.0]]), CORNERS[[0, 1, 1, 2]]])
 def test_invalid_waypoints_are_rejected(points: np.ndarray):
     with pytest.raises(InvalidInputError, match="waypoints"):
         SmoothPath(points)

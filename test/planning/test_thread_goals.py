@@ -12,9 +12,9 @@ import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
+from magnetosuture_thread.planning.executor import ProcedureExecutor, ThreadCondition
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
-from magnetosuture_thread.planning.procedure import Procedure, Wait, parse_procedure
+from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
 from magnetosuture_thread.planning.verdict import GoalJudge
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
@@ -71,24 +71,18 @@ def start_of(planner: NeedlePlanner) -> tuple[np.ndarray, float]:
     [
         ({"wind": {"around": "post", "angle": 5.0}}, around(300.0), True),
         ({"wind": {"around": "post", "angle": 5.0}}, around(340.0), False),  # a wrap would be met
-        ({"wind": {"around": "post", "angle": 5.0, "sense": "clockwise"}}, around(300.0), False),
         ({"unwind": {"around": "post"}}, around(170.0), True),
-        ({"unwind": {"around": "post"}}, around(-190.0), False),
         ({"unwind": {"around": "post", "angle": 3.5}}, around(-190.0), True),
         ({"take_off": {"around": "post"}}, around(90.0, 0.0031), True),
         ({"take_off": {"around": "post"}}, around(90.0, 0.0029), False),
         ({"take_off": {"around": "post"}}, around(190.0, 0.005), False),
-        (past("left"), between((0.01, 0.005), (-0.01, 0.005)), True),
         (past("left"), between((0.01, -0.005), (-0.01, -0.005)), False),
         (past("right"), between((0.01, -0.005), (-0.01, -0.005)), True),
         (laid([[0.0, 0.005], [0.01, 0.005]]), between((0.012, 0.0052), (-0.02, 0.0052)), True),
-        (laid([[0.01, 0.005], [0.0, 0.005]]), between((0.012, 0.0052), (-0.02, 0.0052)), True),
         (laid([[0.0, 0.005], [0.01, 0.005]]), between((0.012, 0.0062), (-0.02, 0.0062)), False),
         (laid([[0.0, 0.005], [0.01, 0.005]]), between((0.005, 0.005), (-0.02, 0.005)), False),
-        (laid([[0.0, 0.005], [0.01, 0.005]], stretch=[0.002, 0.012]), between((0.012, 0.005), (-0.02, 0.005)), True),
         (laid([[0.0, 0.005], [0.01, 0.005]], stretch=[0.005, 0.015]), between((0.012, 0.005), (-0.02, 0.005)), False),
         ({"bring_end": {"position": [-0.02, 0.006]}}, between((0.012, 0.005), (-0.02, 0.005)), True),
-        ({"bring_end": {"position": [0.012, 0.005]}}, between((0.012, 0.005), (-0.02, 0.005)), False),
     ],
 )  # fmt: skip
 def test_a_goal_is_met_by_how_the_thread_lies(goal: dict[str, Any], thread: np.ndarray, is_met: bool):
@@ -105,13 +99,6 @@ def test_a_needle_whose_measured_middle_trembles_on_the_line_has_not_passed_the_
     for y, is_met in ((-1e-3, False), (3e-5, False), (-3e-5, False), (2e-5, False), (6e-5, True)):
         judge.update(np.array([0.0, y]), None)
         assert judge.is_met is is_met
-
-
-def test_no_goal_of_the_thread_is_met_before_the_thread_is_known():
-    judge = GoalJudge(procedure({"unwind": {"around": "post"}}), POST)
-    judge.update(np.zeros(2), None)
-    assert not judge.is_met
-    assert judge.missing(0) == "the thread is not known"
 
 
 def test_repeat_is_its_goals_as_often_and_counts_against_the_limit():
@@ -137,17 +124,13 @@ def test_repeat_is_its_goals_as_often_and_counts_against_the_limit():
     ("goals", "words"),
     [
         ([laid([[-0.01, 0.0], [0.01, 0.0]])], "clear of post"),
-        ([laid([[0.0, 0.02], [0.0, 0.03]])], "clear of wall"),
         ([laid([[-0.015, 0.005], [0.015, 0.005], [0.015, 0.01], [-0.015, 0.01]])], "length of the thread, 50 mm"),
         ([laid([[0.0, 0.005], [0.01, 0.005]], stretch=[0.0, 0.02])], "as long as the line, 10 mm"),
         ([laid([[0.0, 0.005]])], "longer than its tolerance"),
         ([laid([[0.0], [0.005, 0.01, 0.005]])], "along"),
-        ([laid([[0.0, 0.005], [0.01, 0.005], [0.0, 0.0051]])], "stretch"),
-        ([{"bring_end": {"position": [0.001, 0.0]}}], "clear of post"),
         ([{"keep_side": {"around": "post", "to": [0.001, 0.0]}}], "around the needle"),
         ([{"keep_side": {"around": "posts", "to": [0.01, 0.0]}}], "a shape of the scene: post"),
         ([{"wind": {"around": "post", "angle": 30.0}}], "degrees"),
-        ([{"wind": {"around": "post", "angle": 40.0}}], "mm of thread"),
         ([{"wrap": {"around": "post", "angle": 6.0}}, {"take_off": {"around": "post"}},
           {"tighten": {"tension": 1e-5, "toward": [0.01, 0.01]}}], "no wrap before it"),
     ],
@@ -217,39 +200,13 @@ def test_what_a_forecast_does_not_reach_is_refused_with_the_nearest(planner: Nee
         planner.plan(procedure(line), 0, *start_of(planner), np.zeros(2))
 
 
-def test_a_wait_keeps_the_needle_for_its_time_and_goes_on(planner: NeedlePlanner):
-    executor = ProcedureExecutor(procedure({"wait": {"time": 1.0}}, {"go_to": {"position": [0.012, 0.0]}}), planner)
-    tail, heading = np.array([0.012, -0.012]), np.array([0.0, 1.0])
-    executor.start()
-    thread = ThreadCondition(between((0.012, -0.012), (0.012, -0.02)))
-    commands = [executor.update(0.05 * k, tail, heading, thread) for k in range(20)]
-    assert executor.goal == 0
-    assert max(np.linalg.norm(command) for command in commands) <= 1e-5  # it is held, and not driven
-    for k in range(20, 40):
-        command = executor.update(0.05 * k, tail, heading, thread)
-    assert (executor.goal, executor.state) == (1, ProcedureState.RUNNING)
-    assert np.linalg.norm(command) > 1e-4
-    assert isinstance(executor.procedure.goals[0], Wait)
-
-
-def test_a_fast_needle_is_planned_as_a_slow_one(planner: NeedlePlanner):
-    goal = past("left")
-    lengths = []
-    for speed in (1e-4, 2e-3, 0.1):
-        wanted = procedure({**goal, "limits": {"speed": speed}})
-        path = planner.plan(wanted, 0, *start_of(planner), np.zeros(2))
-        assert math.dist(path.middles[-1], (0.0, 0.012)) <= 0.75e-3  # well within the tolerance
-        lengths.append(path.length)
-    assert max(lengths) - min(lengths) < 1e-3
-
-
 def test_a_wait_begins_anew_after_a_pause_by_a_person(planner: NeedlePlanner):
     executor = ProcedureExecutor(procedure({"wait": {"time": 1.0}}, {"go_to": {"position": [0.012, 0.0]}}), planner)
     tail, heading = np.array([0.012, -0.012]), np.array([0.0, 1.0])
     thread = ThreadCondition(between((0.012, -0.012), (0.012, -0.02)))
     executor.start()
-    for k in range(10):
-        executor.update(0.05 * k, tail, heading, thread)
+    commands = [executor.update(0.05 * k, tail, heading, thread) for k in range(10)]
+    assert max(np.linalg.norm(command) for command in commands) <= 1e-5  # it is held, and not driven
     executor.pause("by hand")
     executor.update(3.0, tail, heading, thread)
     executor.start()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.geometry.scene import Scene as TrackedScene
-from magnetosuture_thread.rig.camera import CameraScene, Cover, DishCamera, Lighting
+from magnetosuture_thread.rig.camera import CameraScene, Cover, DishCamera
 from magnetosuture_thread.vision.tracker import Track
 
 SCENE = TrackedScene()  # a dish of 35 mm with nothing in it
@@ -49,19 +48,19 @@ class Pose:
 CURVATURES = (-440.0, -190.0, 110.0, 400.0)
 
 
-def random_pose(random: np.random.Generator, *, curved: bool, within: float = 0.0158) -> Pose:
-    """Draw a pose whose needle lies within a circle around the dish's centre [m]."""
+def random_pose(random: np.random.Generator, *, curved: bool) -> Pose:
+    """Draw a pose whose needle lies within a circle of 15.8 mm around the dish's centre."""
     while True:
         curvature = float(random.choice(CURVATURES)) if curved else 0.0
-        pose = Pose(random.uniform(-within, within, 2), random.uniform(-np.pi, np.pi), curvature)
+        pose = Pose(random.uniform(-0.0158, 0.0158, 2), random.uniform(-np.pi, np.pi), curvature)
         axis = needle_axis(pose.tail, pose.heading, 0.007, curvature, np.linspace(0.0, 1.0, 9))[0]
-        if np.linalg.norm(axis, axis=1).max() < within:
+        if np.linalg.norm(axis, axis=1).max() < 0.0158:
             return pose
 
 
-def random_thread(random: np.random.Generator, pose: Pose, length: float = 0.019) -> np.ndarray:
+def random_thread(random: np.random.Generator, pose: Pose) -> np.ndarray:
     """Draw a thread that winds away from a needle's tail and stays in the dish, shape (m, 2) [m]."""
-    steps = 200
+    steps, length = 200, 0.019
     for _ in range(100):
         bend = np.interp(np.linspace(0.0, 1.0, steps), np.linspace(0.0, 1.0, 6), random.uniform(-350.0, 350.0, 6))
         angle = pose.heading + np.pi + random.normal(0.0, 0.3) + np.cumsum(bend) * length / steps
@@ -73,9 +72,9 @@ def random_thread(random: np.random.Generator, pose: Pose, length: float = 0.019
 
 
 @lru_cache(maxsize=6)  # a camera holds some 50 MB
-def camera_for(seed: int, lighting: Lighting | None, scene: CameraScene) -> DishCamera:
+def camera_for(seed: int) -> DishCamera:
     """Return a camera; making one takes as long as ten frames."""
-    return DishCamera(scene, VIEW, seed=seed, lighting=lighting)
+    return DishCamera(CameraScene(), VIEW, seed=seed)
 
 
 def render(
@@ -85,14 +84,10 @@ def render(
     seed: int = 5,
     covers: tuple[Cover, ...] = (),
     gain: float = 1.0,
-    lighting: Lighting | None = None,
-    **scene: Any,
 ) -> np.ndarray:
     """Draw a frame."""
-    what = CameraScene(needle_curvature=pose.curvature, **scene)
-    still = CameraScene(dish_diameter=what.dish_diameter, obstacles=what.obstacles, looks=what.looks)
-    camera = camera_for(seed, lighting, still)
-    camera._scene = what  # needle and thread are drawn in each frame anew
+    camera = camera_for(seed)
+    camera._scene = CameraScene(needle_curvature=pose.curvature)  # needle and thread are drawn in each frame anew
     camera._random = np.random.default_rng(seed)  # a frame is the same whatever was drawn before it
     return camera.render(pose.tail, pose.heading, thread, covers, gain)
 

@@ -1,4 +1,4 @@
-"""The dish is found, and only where there is one; the watch over it notices a bumped camera."""
+"""The dish is found where it is."""
 
 from __future__ import annotations
 
@@ -55,21 +55,3 @@ def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
     reasons = [watch.look(bright)[0] for _ in range(LONG_SEARCH)]
     assert reasons[0] != ""
     assert reasons[-1] == ""
-
-
-def test_a_bright_rim_around_a_bright_floor_is_no_dark_field():
-    clear = np.full((480, 640), 240, np.uint8)
-    cv2.circle(clear, (322, 238), 217, 180, -1, cv2.LINE_AA)
-    cv2.circle(clear, (322, 238), 220, 255, 6, cv2.LINE_AA)
-    assert find_dish(255 - clear, 0.035) is not None  # its negative looks like a dish
-    found = see_dish(clear, VisionTrackerSettings(), 0.035)
-    assert found is None or not found.dark_field
-
-
-def test_the_edge_of_an_overexposed_floor_gives_no_scale():
-    step = np.full((480, 640), 120, np.uint8)
-    cv2.circle(step, (322, 238), 200, 255, -1, cv2.LINE_AA)
-    assert find_dish(step, 0.035) is None
-    found = find_dish(np.minimum(step, 240), 0.035)
-    assert found is not None
-    assert found.metres_per_pixel == pytest.approx(0.0175 / 200.0, rel=6e-3)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.photographs import DIAMETER, RIGHT, ellipse_error, photo_of
-from magnetosuture_thread.vision.dish import Ellipse, find_rings, inner_ring, see_dish
+from magnetosuture_thread.vision.dish import Ellipse, find_rings, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import Pose, render
 
@@ -46,16 +46,6 @@ def test_most_dishes_in_photographs_are_found(name: str):
     assert right >= 4
 
 
-@pytest.mark.parametrize("levels", [(40, 200), (200, 40), (255, 128), (120, 100)])
-@pytest.mark.parametrize("ratio", [1.0, 0.93, 0.84])
-def test_an_ellipse_is_measured_to_a_part_of_a_pixel_whichever_side_is_brighter(levels: tuple[int, int], ratio: float):
-    given = Ellipse((330.3, 228.6), 150.0, ratio * 150.0, 0.7)
-    found = inner_ring(find_rings(drawn(given, (640, 480), *levels)))
-    assert math.dist(found.centre_px, given.centre_px) < 0.3
-    assert found.major == pytest.approx(given.major, abs=0.5)
-    assert found.minor == pytest.approx(given.minor, abs=0.5)
-
-
 def test_a_given_scale_is_used_and_a_warning_says_by_how_much_the_dish_contradicts_it():
     frame = render(Pose(np.zeros(2), 0.3))
     for share, remark in ((1.02, ""), (1.07, "is 7% off the dish"), (0.94, "is 6% off the dish")):
@@ -85,21 +75,6 @@ def test_a_wall_of_two_edges_makes_the_doubt_of_the_scale_unless_the_user_names_
                 assert 0.0175 / found.view.metres_per_pixel / size == pytest.approx(radius, rel=0.01)
                 assert found.warning == ""
             assert found.scale_error == pytest.approx(doubt, rel=0.25)
-
-
-def test_one_edge_that_is_no_circle_is_no_tilt_and_two_that_agree_are():
-    wall, lid = (Ellipse((330.3, 238.6), radius, 0.985 * radius, 0.7) for radius in (160.0, 182.0))
-    for edges, degrees in (([wall], None), ([wall, lid], 9.9)):
-        image = np.asarray(np.mean([drawn(edge, (640, 480), 90, 40) for edge in edges], axis=0), dtype=np.uint8)
-        found = see_dish(image, VisionTrackerSettings(), 0.035)
-        assert found is not None
-        if degrees is None:
-            assert found.tilt is None
-            assert "tilted" not in found.warning
-            assert math.degrees(found.unseen_tilt) == pytest.approx(9.9, abs=1.0)
-        else:
-            assert found.tilt is not None
-            assert math.degrees(found.tilt.angle) == pytest.approx(degrees, abs=1.0)
 
 
 def test_no_ellipse_is_found_where_there_is_none():

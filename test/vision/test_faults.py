@@ -127,23 +127,17 @@ def test_of_two_needles_the_one_with_a_thread_is_taken_and_none_if_both_have_one
     assert TRACKER.look(np.minimum(with_thread, render(other, threads[1]))).reason.startswith("2 needles in the dish")
 
 
-def something_else(kind: str, size: tuple[int, int] = (640, 480)) -> np.ndarray:
+def something_else(kind: str) -> np.ndarray:
     """Return a picture in which there is no dish."""
-    random, (width, rows) = np.random.default_rng(3), size
     if kind == "noise":
-        return random.integers(0, 255, (rows, width, 3)).astype(np.uint8)
-    picture = np.full((rows, width, 3), {"black": 0, "white": 255}.get(kind, 190), np.uint8)
-    if kind == "text":
-        for row in range(20, rows, 19):
-            cv2.putText(picture, "the quick brown fox jumps over it", (5, row), 0, 0.9, (20, 20, 20), 2)
+        return np.random.default_rng(3).integers(0, 255, (480, 640, 3)).astype(np.uint8)
+    picture = np.full((480, 640, 3), 0 if kind == "black" else 190, np.uint8)
     if kind == "face":
-        cv2.ellipse(picture, (width // 2, rows // 2), (130, 180), 0, 0, 360, (140, 165, 215), -1)
-        for at in (-50, 50):
-            cv2.circle(picture, (width // 2 + at, rows // 2 - 40), 20, (250, 250, 250), -1)
+        cv2.ellipse(picture, (320, 240), (130, 180), 0, 0, 360, (140, 165, 215), -1)
     return picture
 
 
-@pytest.mark.parametrize("kind", ["black", "white", "noise", "text", "face"])
+@pytest.mark.parametrize("kind", ["black", "noise", "face"])
 def test_a_video_of_something_else_is_lost_with_its_reason_and_the_needle_is_back_with_the_dish(kind: str):
     pose = Pose(np.array([0.003, -0.002]), 0.4)
     frame, other = render(pose, random_thread(np.random.default_rng(1), pose)), something_else(kind)

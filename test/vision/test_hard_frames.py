@@ -11,10 +11,11 @@ import pytest
 
 from benchmarks.vision.frames import DISH_RADIUS
 from benchmarks.vision.measurements import Row, frame_of, measure, row_of
+from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.geometry.scene import Dish, Scene
-from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.geometry.thread_observation import PieceEnd
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import State, VisionTracker
+from magnetosuture_thread.vision.tracker import State, Track, VisionTracker
 
 SCENE = Scene(dish=Dish(2.0 * DISH_RADIUS))
 SEED = 4711
@@ -38,6 +39,7 @@ LIMITS: dict[str, tuple[int, float, float]] = {
     "second_needle": (FRAMES - 1, 0.7, 0.02),
     "cut_dish_far": (FRAMES // 2, 0.3, 0.02),
 }
+COVERS = ["cover_1.5mm", "cover_3mm", "cover_6mm", "cover_10mm", "two_covers", "hand_instrument"]
 
 
 @cache
@@ -102,20 +104,6 @@ def test_a_tilt_that_two_rings_agree_on_is_warned_of_and_errors_of_any_are_withi
     assert not VisionTracker(VisionTrackerSettings(), SCENE).look(frame_of("usual", 0, SEED)[1]).warning
 
 
-def test_the_view_of_a_large_frame_is_in_its_own_pixels():
-    case, image = frame_of("width_1920", 0, SEED)
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
-    found = tracker.look(image)
-    assert found.view is not None
-    np.testing.assert_allclose(found.view.centre_px, case.view.centre_px, atol=1.0)
-    u, v = found.view.centre_px
-    given = VisionTrackerSettings(dish_centre_px=(u, v), metres_per_pixel=found.view.metres_per_pixel, confirm_frames=1)
-    for seen in (VisionTracker(given, SCENE).look(image), VisionTracker(given, SCENE).track(image, 0.0)):
-        np.testing.assert_allclose(seen.tail, found.tail, atol=1e-5)
-        assert seen.view is not None
-        np.testing.assert_allclose(seen.view.centre_px, (u, v))
-
-
 @pytest.mark.parametrize("name", ["usual", "dark_field"])
 def test_with_a_given_view_a_dim_floor_and_a_dark_one_are_told_apart(name: str):
     case, image = frame_of(name, 0, SEED)
@@ -139,6 +127,56 @@ def test_a_view_that_cannot_be_gives_no_pose_and_no_error(centre: tuple[float, f
             assert found.reason
 
 
-def test_a_scale_that_no_camera_has_is_refused():
-    with pytest.raises(ConfigurationError, match="at least 1e-07 m"):
-        VisionTrackerSettings(metres_per_pixel=1e-12)
+def tracker_of(name: str, index: int) -> tuple[VisionTracker, np.ndarray, float]:
+    """Return a tracker for a frame, the frame, and the thread's length [m]."""
+    case, image = frame_of(name, index, SEED)
+    length = float(arc_lengths(case.thread)[-1])
+    return VisionTracker(VisionTrackerSettings(thread_length=length), SCENE), image, length
+
+
+def look(name: str, index: int) -> Track:
+    """Return what a tracker makes of a frame."""
+    tracker, image, _ = tracker_of(name, index)
+    return tracker.look(image)
+
+
+@pytest.mark.parametrize("name", COVERS)
+def test_the_thread_is_found_on_both_sides_of_what_covers_it(name: str):
+    assert row(name).pieces >= 0.9
+    assert (row(name).wrong_pieces or 0.0) < 0.01
+
+
+@pytest.mark.parametrize("name", [*COVERS, "cover_end", "cover_crossing", "glare_thread"])
+def test_no_piece_is_said_to_lie_where_it_does_not_and_no_part_is_taken_for_all(name: str):
+    assert (row(name).misplaced, row(name).incomplete, row(name).not_free) == (0, 0, 0)
+
+
+def test_a_covered_end_is_neither_free_nor_is_the_thread_complete():
+    assert (row("cover_end").complete, row("cover_end").free) == (0, 0)
+    for index in range(FRAMES):
+        assert PieceEnd.COVERED in {piece.last_end for piece in look("cover_end", index).observation.pieces}
+
+
+@pytest.mark.parametrize("name", ["usual", "cover_6mm", "crossing_needle"])
+def test_standard_deviations_are_honest(name: str):
+    assert 0.6 < (row(name).normalised or 0.0) < 1.4
+
+
+def test_pieces_beyond_a_cover_are_joined_with_an_interval_of_arc_length():
+    joined = [look("two_covers", index).observation for index in range(FRAMES)]
+    placed = [[piece for piece in each.pieces if np.isfinite(piece.arc_length[0])] for each in joined]
+    assert sum(len(each) == 3 for each in placed) >= FRAMES - 2
+    for pieces in placed:
+        lows = [piece.arc_length[0] for piece in pieces]
+        assert lows == sorted(lows)
+        for piece in pieces:
+            assert piece.arc_length[0] <= piece.arc_length[1]
+            assert len(piece.deviation) == len(piece.points)
+
+
+def test_with_a_wrong_length_no_frame_is_complete_and_no_end_is_free():
+    _, image, length = tracker_of("usual", 0)
+    for wrong in (0.7 * length, 1.5 * length):
+        track = VisionTracker(VisionTrackerSettings(thread_length=wrong), SCENE).look(image)
+        assert not track.observation.complete
+        assert PieceEnd.FREE not in {piece.last_end for piece in track.observation.pieces}

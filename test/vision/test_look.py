@@ -1,4 +1,4 @@
-"""One frame alone: the sample frames, and rendered ones in other light."""
+"""One frame alone."""
 
 from __future__ import annotations
 
@@ -9,10 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.scene import Dish
-from magnetosuture_thread.geometry.scene import Scene as DishScene
-from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
@@ -53,25 +49,6 @@ def test_the_sample_frames_are_measured_to_half_a_pixel_and_a_degree(given_view:
     assert min(share for _, share in lines) > 0.95
 
 
-def test_a_larger_dish_with_a_faint_thread_is_tracked():
-    view = DishView((644.0, 476.0), 0.15 / 875.0)
-    camera = DishCamera(
-        CameraScene(dish_diameter=0.15, needle_curvature=150.0, thread_diameter=66e-6), view, (1280, 960), 1
-    )
-    s = np.linspace(0.0, 0.15, 500)
-    tail, angle = np.array([0.03, 0.01]), np.pi - 0.4 + 35.0 * s
-    thread = np.vstack([tail, tail + np.cumsum(0.15 / 500 * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)])
-    seen = VisionTracker(VisionTrackerSettings(thread_length=0.15), DishScene(Dish(0.15))).look(
-        camera.render(tail, -0.4, thread)
-    )
-    assert seen.reason == ""
-    assert np.linalg.norm(seen.tail - tail) < 1.0 * view.metres_per_pixel
-    assert abs(np.arctan2(seen.heading[1], seen.heading[0]) + 0.4) < np.radians(2.0)
-    mean, share = line_error(view.to_pixels(seen.centreline), view.to_pixels(thread))
-    assert mean < 1.0
-    assert share > 0.95
-
-
 @pytest.mark.parametrize("rotation", [0.5, -2.0])
 def test_a_turned_camera_gives_the_same_pose_in_the_dish(rotation: float):
     pose = Pose(np.array([0.003, -0.002]), 0.8, 120.0)
@@ -87,22 +64,10 @@ def test_a_turned_camera_gives_the_same_pose_in_the_dish(rotation: float):
 
 @pytest.mark.parametrize(
     "image",
-    [
-        np.zeros((480, 640, 3), np.float32),
-        np.zeros((480, 640, 4), np.uint8),
-        np.zeros((10, 10, 3), np.uint8),
-        np.zeros(7, np.uint8),
-        np.zeros((0, 0, 3), np.uint8),
-    ],
+    [np.zeros((480, 640, 3), np.float32), np.zeros((10, 10, 3), np.uint8), np.zeros(7, np.uint8)],
 )
 def test_what_is_no_image_is_refused(image: np.ndarray):
     with pytest.raises(InvalidInputError, match="image"):
         TRACKER.look(image)
     with pytest.raises(InvalidInputError, match="image"):
         VisionTracker(VisionTrackerSettings(), SCENE).track(image, 0.0)
-
-
-@pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (2e-5, 4), (1e-6, 7)])
-def test_frames_are_shrunk_until_the_needle_is_five_pixels_wide_or_the_frame_small(scale: float, factor: int):
-    """By the scale that is given: 0.4 mm are then 20 px, and 400 px of a frame of 480 rows, of which 64 are left."""
-    assert VisionTrackerSettings(needle_width=4e-4, metres_per_pixel=scale).working_factor((480, 640), 0.035) == factor

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import UNDIRECTED, State, Track, VisionTracker
@@ -99,12 +100,18 @@ def test_the_axis_is_found_and_a_point_near_the_tip_gives_its_direction(rounded:
     assert found >= least
 
 
-def test_a_direction_is_carried_over_while_the_rod_turns_round_and_not_over_a_gap_in_which_it_could():
-    _, ends, told = Rod(4).drawn()
+def rod_in_view() -> tuple[np.ndarray, np.ndarray, VisionTracker, DishView]:
+    """Return a picture of a rod, its ends (u, v) [px], a tracker that has looked at it, and its view."""
+    image, ends, told = Rod(4).drawn()
     tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(Rod(4).drawn()[0]).view
+    view = tracker.look(image).view
     assert view is not None
-    assert tracker.track(Rod(4).drawn()[0], 0.0).reason == UNDIRECTED
+    return image, ends, tracker, view
+
+
+def test_a_direction_is_carried_over_while_the_rod_turns_round_and_not_over_a_gap_in_which_it_could():
+    image, ends, tracker, view = rod_in_view()
+    assert tracker.track(image, 0.0).reason == UNDIRECTED
     tracker.point_at_tip(view.to_dish(ends[1]))
     tracked = 0
     for index in range(1, 50):  # by 3.9 rad
@@ -117,10 +124,7 @@ def test_a_direction_is_carried_over_while_the_rod_turns_round_and_not_over_a_ga
 
 
 def test_a_point_far_from_both_ends_and_one_that_was_used_tell_nothing():
-    image, ends, told = Rod(4).drawn()
-    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(image).view
-    assert view is not None
+    image, ends, tracker, view = rod_in_view()
     across = np.array([ends[0, 1] - ends[1, 1], ends[1, 0] - ends[0, 0]])
     for place, state in (
         (ends[1] + 0.8 * across, State.LOST),
@@ -133,10 +137,7 @@ def test_a_point_far_from_both_ends_and_one_that_was_used_tell_nothing():
 
 
 def test_a_rod_elsewhere_may_have_turned_round_unseen_and_has_no_direction():
-    image, ends, told = Rod(4).drawn()
-    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(image).view
-    assert view is not None
+    image, ends, tracker, view = rod_in_view()
     tracker.point_at_tip(view.to_dish(ends[1]))
     frames = [tracker.track(Rod(4, turned=1e-6 * index).drawn()[0], index / RATE) for index in range(9)]
     assert frames[-1].state is State.TRACKED
@@ -148,10 +149,7 @@ def test_a_rod_elsewhere_may_have_turned_round_unseen_and_has_no_direction():
 
 
 def test_a_point_is_of_its_time():
-    image, ends, told = Rod(4).drawn()
-    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(image).view
-    assert view is not None
+    image, ends, tracker, view = rod_in_view()
     for time, until, reason in ((2.0, 1.9, UNDIRECTED), (2.1, 2.2, "a needle seen in 1 of 3 frames")):
         tracker.point_at_tip(view.to_dish(ends[1]), until)
         assert tracker.track(image, time).reason == reason

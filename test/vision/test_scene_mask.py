@@ -6,25 +6,19 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-import shapely
 
-from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.geometry.scene_shapes import scene_from_mapping
 from magnetosuture_thread.rig import camera as drawn
 from magnetosuture_thread.rig.camera import DishCamera, Look
-from magnetosuture_thread.vision.images import scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import Track, VisionTracker
-from test.vision.scenes import PIXEL, VIEW, Pose, line_error, random_thread
+from test.vision.scenes import PIXEL, VIEW, Pose, line_error
 
 STEEL = Look((70.0, 66.0, 62.0), (60.0, 56.0, 52.0), 0.2e-3, 10.0, 3.0)
 OUTLINED = Look((200.0, 205.0, 215.0), (95.0, 95.0, 95.0), 0.25e-3)
-SILICONE = drawn.SILICONE
-POSTS = [(0.008, 0.004, 0.0015), (-0.008, 0.003, 0.001), (0.002, -0.009, 0.0012), (-0.006, -0.008, 0.0009)]
-POSTS += [(0.0, 0.0095, 0.0009), (0.011, -0.005, 0.0009), (-0.0115, -0.003, 0.0011)]
 POST = Disc((0.0077, 0.0039), 0.0015)
 NEEDLE_LIKE = [[0.002, 0.0098], [0.0076, 0.0098], [0.009, 0.00999], [0.009, 0.01001], [0.0076, 0.0102], [0.002, 0.0102]]
 
@@ -45,15 +39,6 @@ def seen_with_and_without(scene: Scene, frame: np.ndarray) -> tuple[Track, Track
     """Return what is seen of a frame with the scene, and with its dish alone."""
     settings = VisionTrackerSettings()
     return VisionTracker(settings, scene).look(frame), VisionTracker(settings, Scene(scene.dish)).look(frame)
-
-
-def test_a_needle_among_many_dark_posts_is_found():
-    scene = described(**{f"post_{i}": {"disc": {"center": [x, y], "radius": r}} for i, (x, y, r) in enumerate(POSTS)})
-    pose = Pose(np.array([-0.002, -0.002]), 0.7)
-    frame = frame_of(scene, STEEL, pose, random_thread(np.random.default_rng(0), pose))
-    masked, plain = seen_with_and_without(scene, frame)
-    assert pose.is_right(masked)
-    assert "dark things" in plain.reason
 
 
 def test_an_instrument_that_looks_like_a_needle_is_not_taken_for_one():
@@ -83,23 +68,6 @@ def test_a_needle_beside_a_dark_post_is_found(gap: float):
     assert "no arc" in plain.reason
 
 
-def wrapped(turn: float) -> tuple[Pose, np.ndarray]:
-    """Return a needle and a thread from its tail to the post, and around it by an angle."""
-    angle = -0.5 * np.pi + np.linspace(0.0, turn, 80)
-    around = np.asarray(POST.centre) + (POST.radius + 4e-5) * np.column_stack([np.cos(angle), np.sin(angle)])
-    tail = around[0] - (0.003, 0.0)
-    return Pose(tail, np.pi), np.vstack([np.linspace(tail, around[0], 20)[:-1], around])
-
-
-@pytest.mark.parametrize("turn", [0.7, 2.0, 3.5])
-def test_a_thread_around_a_plain_post_is_followed_to_its_end(turn: float):
-    pose, thread = wrapped(turn)
-    scene = read_scene("dish_35mm_post")
-    masked, plain = seen_with_and_without(scene, frame_of(scene, SILICONE, pose, thread))
-    for seen in (masked, plain):
-        assert line_error(seen.centreline / PIXEL, thread / PIXEL)[1] > 0.95
-
-
 def test_a_thread_that_ends_at_a_dark_outline_is_not_followed_around_it():
     scene = described(tool={"capsule": {"start": [-0.008, -0.004], "end": [0.005, -0.004], "radius": 0.0008}})
     thread = np.array([[0.0085, -0.0026], [0.005, -0.00316], [0.003, -0.00316]])
@@ -110,22 +78,3 @@ def test_a_thread_that_ends_at_a_dark_outline_is_not_followed_around_it():
     assert excess[0] < 0.1
     assert excess[1] > 0.3
     assert line_error(masked.centreline / PIXEL, thread / PIXEL)[1] > 0.95
-
-
-def test_solid_and_depth_agree_with_the_geometry():
-    scene = read_scene("hernia_ring")
-    view = DishView((322.3, 238.4), 1.1e-4, rotation=0.3)
-    mask = scene_mask(scene, view, (480, 640), 3e-4)
-    assert mask is not None
-    random = np.random.default_rng(0)
-    pixels = np.column_stack([random.integers(160, 499, 400), random.integers(100, 399, 400)]).astype(float)
-    shapes = shapely.union_all([shape.solid for shape in scene.shapes])
-    points = [shapely.Point(point) for point in view.to_dish(pixels)]
-    exact = np.array([-shapes.distance(p) or shapes.boundary.distance(p) for p in points]) / view.metres_per_pixel
-    assert np.abs(mask.depths(pixels) - exact).max() < 1.5
-    part = mask.part(160, 96, 500, 400)
-    np.testing.assert_array_equal(part.depths(pixels - (160, 96)), mask.depths(pixels))
-    np.testing.assert_allclose(part.rim[:, :2] + (160, 96), mask.rim[:, :2])
-    cells = random.integers(0, 255, (60, 80)).astype(np.uint8)
-    near = mask.part(80, 40, 600, 440)  # around all shapes, so that it shows the floor beside them
-    np.testing.assert_array_equal(near.show_floor(cells[5:55, 10:75]), mask.show_floor(cells)[5:55, 10:75])

@@ -1,22 +1,10 @@
-"""The drivers without hardware: one that records, and one for the simulated rig."""
+"""The driver of the simulated rig."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from magnetosuture_thread.coils.drivers import RecordingDriver, SimulatedDriver, make_driver
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
-
-
-def test_it_keeps_what_it_was_told_and_ends_with_zeros():
-    driver = make_driver(CoilBridgeSettings(), 4, lambda currents: None, lambda: 0)
-    assert isinstance(driver, RecordingDriver)
-    driver.open()
-    currents = np.array([1.0, 0.0, 0.5, 0.0])
-    driver.apply(currents, 0.0)
-    currents[0] = 9.0
-    driver.close()
-    assert [applied.tolist() for applied in driver.applied] == [[1.0, 0.0, 0.5, 0.0], [0.0] * 4]
+from magnetosuture_thread.coils.drivers import SimulatedDriver
 
 
 def test_it_sends_while_somebody_listens_and_ends_with_zeros():

@@ -1,4 +1,4 @@
-"""Contacts of segments between their nodes: against distances of finely sampled segments, and of threads drawn over."""
+"""Contacts of segments between their nodes: against distances by shapely."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 import shapely
 
 from magnetosuture_thread.geometry.chords import find_chord_contacts
-from magnetosuture_thread.geometry.obstacles import Contacts, Disc, Obstacle, Polygon, Workspace
-from test.thread.scenes import east
+from magnetosuture_thread.geometry.obstacles import Contacts, Obstacle, Polygon, Workspace
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 REACH = 0.02  # of nodes; chords have a part of it
@@ -63,13 +62,6 @@ def test_a_chord_past_a_corner_has_its_distance(polygon: Polygon):
     assert tried > 20
 
 
-def test_a_chord_that_cuts_a_corner_is_as_deep_as_the_corner_sticks_out():
-    (found,) = contacts(SQUARE, np.array([0.0085, 0.0104]), np.array([0.0104, 0.0085]))
-    depth = shapely.LineString([(0.0085, 0.0104), (0.0104, 0.0085)]).distance(shapely.Point(0.01, 0.01))
-    assert found[0] == pytest.approx(-depth, abs=1e-12)
-    np.testing.assert_allclose(found[2], [math.sqrt(0.5), math.sqrt(0.5)], atol=1e-12)
-
-
 DENTED = Polygon((*SQUARE.outline[:3], (0.005, 0.0099), SQUARE.outline[3]))
 
 
@@ -88,21 +80,3 @@ def test_a_corner_that_is_not_the_nearest_of_a_chord_is_no_contact(
 ):
     along = 0.5 * SEGMENT * np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees))])
     assert not contacts(polygon, np.array(middle) - along, np.array(middle) + along)
-
-
-@pytest.mark.parametrize("centre", [(0.0, 0.0), (0.0, 0.0, 0.0)])
-def test_around_a_disc_arcs_touch_and_beside_it_chords_do(centre: tuple[float, ...]):
-    disc, half = Disc(centre, 0.02), 0.5 * SEGMENT / 0.02
-    angles = half * np.array([-3.0, -1.0, 1.0, 3.0])
-    nodes = np.zeros((4, len(centre)))
-    nodes[:, 0], nodes[:, 1] = 0.02 * np.cos(angles), 0.02 * np.sin(angles)
-    around = contacts_of(disc, nodes)
-    assert [place for _, place, _ in around] == pytest.approx([0.5] * 3)
-    # The end segments have the turn of one node only.
-    assert sorted(distance for distance, _, _ in around)[-1] == pytest.approx(0.0, abs=1e-6)
-    straight = np.zeros((4, len(centre)))
-    straight[:, 0], straight[:, 1] = 0.0201, SEGMENT * np.array([-1.4, -0.4, 0.6, 1.6])
-    ((distance, place, normal),) = contacts_of(disc, straight)
-    assert distance == pytest.approx(1e-4)
-    assert place == pytest.approx(0.4)
-    np.testing.assert_allclose(normal, east(len(centre)), atol=1e-12)

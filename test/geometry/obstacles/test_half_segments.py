@@ -52,19 +52,6 @@ def test_no_point_of_a_chord_is_closer_than_its_distance_and_one_is_as_close(see
                 assert found[row] <= contacts.distance[row]
 
 
-def test_a_chord_across_a_corner_is_as_deep_as_the_corner():
-    """Both nodes are outside; the chord passes 0.2 mm below the corner, as deep in as the edges are from there."""
-    square = Polygon(((0.0, 0.0), (-0.01, 0.0), (-0.01, -0.01), (0.0, -0.01)))
-    depth, half = 2e-4, 1e-3
-    along, inward = np.array([1.0, -1.0]) / np.sqrt(2.0), np.array([-1.0, -1.0]) / np.sqrt(2.0)
-    nodes = depth * inward + np.outer([-half, half], along)
-    workspace = Workspace([square], REACH)
-    contacts = workspace.near(nodes)
-    found = half_segment_distances(nodes, workspace.data, contacts)
-    assert (contacts.distance > 0.5e-3).all()
-    np.testing.assert_allclose(found, -depth / np.sqrt(2.0), atol=2e-7)
-
-
 def test_beside_an_edge_and_through_a_thin_shape_nothing_is_missed():
     thin = Polygon(((-1e-4, -5e-3), (1e-4, -5e-3), (1e-4, 5e-3), (-1e-4, 5e-3)))
     workspace = Workspace([thin, Disc((0.0, 8e-3), 1e-3)], REACH)

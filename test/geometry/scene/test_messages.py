@@ -67,18 +67,14 @@ def of_one(of: str, value: Any) -> Callable[[Any], None]:
 
 DAMAGE: list[tuple[Callable[[Any], None], str]] = [
     (of_one("shapes.1.polygon.0.outline.corners.3.x", 0.00501), "scene.version: got '"),
-    (of_one("shapes.0.disc.0.radius", np.nextafter(0.0015, 1.0)), "scene.version: got '"),
     (swap_two, "scene.version: got '"),
     (of_one("version", "x" * 10_000), "scene.version: got 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx', expected '"),
-    (of_one("dish_diameter", 50.0), "scene.dish.diameter: got 50.0, expected a number from 0.005 to 0.5 m"),
     (of_one("dish_diameter", float("nan")), "scene.dish.diameter: got nan, expected a number"),
     (of_one("header.frame_id", "map"), "scene.header.frame_id: got 'map', expected 'dish'"),
     (of_one("shapes.0.kind", "bone"), "scene.post.kind: got 'bone', expected one of tissue"),
-    (of_one("shapes.0.name", "p" * 10_000), "scene.shapes[0].name: got 10000, expected at most 64"),
     (of_one("shapes.0.name", "a\nb"), r"scene.shape.name: got 'a\nb', expected 1 to 64 printable characters"),
     (of_one("shapes.0.disc", []), "scene.shapes[0]: got 0 discs and 0 polygons, expected one disc or one polygon"),
     (of_one("shapes.0.disc.0.radius", float("inf")), "scene.post.disc.radius: got inf, expected a number from"),
-    (of_one("shapes.1.polygon.0.outline.corners", []), "scene.ring.polygon.outline: got '0 distinct points', expected"),
     (of_one("shapes.1.polygon.0.outline.corners.5.y", -0.01), "scene.ring.polygon.outline: got 'Self-inter"),
 ]
 

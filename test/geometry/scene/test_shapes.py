@@ -112,18 +112,6 @@ def test_a_rectangle_is_turned_about_its_centre(angle: float):
     assert soft.area == pytest.approx(exact, abs=ARC_TOLERANCE * 2.0 * math.pi * 0.0005)
 
 
-def test_a_polygon_keeps_its_points_bit_for_bit_and_its_holes():
-    outline = [[0.0, 0.0], [0.01, 1e-5 / 3.0], [0.01, 0.01], [0.0, 0.01]]
-    hole = [[0.004, 0.004], [0.006, 0.004], [0.006, 0.006], [0.004, 0.006]]
-    shape = polygon(polygon={"outline": outline, "holes": [hole]})
-    assert shape.outline == tuple(map(tuple, outline))
-    assert shape.area == pytest.approx(1e-4 - 0.5 * 0.01 * 1e-5 / 3.0 - 4e-6, rel=1e-12)
-    soft = polygon(polygon={"outline": outline, "holes": [hole]}, corner_radius=0.0005)
-    lost = (4.0 - math.pi) * 0.0005**2  # of the outline's corners; those of the hole give as much back
-    assert soft.area == pytest.approx(shape.area, abs=0.1 * lost)
-    assert len(soft.outline) > 20
-
-
 RING = {"center": [0.0, 0.0], "inner_radius": 0.001, "outer_radius": 0.002}
 SECTOR = {**RING, "start_angle": 0.0, "end_angle": 1.0}
 SQUARE = [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01]]
@@ -132,19 +120,14 @@ PLATE = {"center": [0, 0], "width": 0.01, "height": 0.002}
 
 BAD: list[tuple[Any, str]] = [
     (None, "post: got None, expected a shape, one of disc, annulus"),
-    ({"disc": DISC, "annulus": RING}, "post: got ['disc', 'annulus'], expected"),
     ({"disc": DISC, "kind": "bone"}, "post.kind: got 'bone', expected one of tissue, instrument, wall"),
-    ({"disc": {"center": [0.0, 0.0]}}, "post.disc.radius: got None, expected a number from"),
     ({"disc": {**DISC, "raduis": 0.1}}, "post.disc.raduis: got 0.1, expected one of center, radius (did you mean"),
-    ({"disc": {**DISC, "radius": 10**400}}, "post.disc.radius: got 1000000000"),
     ({"disc": {**DISC, "center": [7.7, 3.9]}}, "post.disc.center: got [7.7, 3.9], expected two coordinates x, y of at"),
     ({"disc": DISC, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected 0 m: a disc has no corners"),
-    ({"annular_sector": {**SECTOR, "end_angle": 0.0}}, "post.annular_sector.end_angle: got 0.0, expected more than"),
     ({"annular_sector": {**SECTOR, "inset": 0.0006}}, "post.annular_sector.inset: got 0.0006, expected less than half"),
     ({"capsule": {"start": [0, 0], "end": [0, 0], "radius": 0.001}}, "post.capsule.end: got [0.0, 0.0], expected an"),
     ({"rectangle": PLATE, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected at most 0.49 of the sh"),
     ({"polygon": {"outline": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "post.polygon.outline: got 'Self-intersection"),
-    ({"polygon": {"outline": SQUARE * 376}}, "post.polygon.outline: got '1504 points', expected at most 1500"),
     ({"polygon": {"outline": SQUARE}, "corner_radius": 0.006}, "post.corner_radius: got 0.006, expected a radius of"),
 ]
 

@@ -13,11 +13,8 @@ import magnetosuture_thread.rig.campaign as campaign
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands.evaluate import evaluate_bags
-from magnetosuture_thread.planning.executor import ThreadCondition
-from magnetosuture_thread.planning.planner import NeedlePlanner
-from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, parse_procedure, read_procedure
-from magnetosuture_thread.rig.campaign import RunExtremes, RunResult, run_procedure, vary
-from magnetosuture_thread.rig.closed_loop import LoopFrame
+from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
+from magnetosuture_thread.rig.campaign import RunResult, run_procedure, vary
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
 
 SHORT = {"goals": [{"go_to": {"position": [0.008, -0.0145], "tolerance": 1e-3}}], "setup": "hernia_ring"}
@@ -69,22 +66,6 @@ def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_var
     assert np.abs(gains - 1.0).max() <= 0.05
     assert min(each.setup.rig.thread_friction for each in drawn) >= 0.0
     assert max(each.setup.rig.thread_friction for each in drawn) <= 0.3
-
-
-def test_tension_and_friction_are_compared_with_the_limits_of_the_present_goal(hernia: Setup, short: Procedure):
-    limits = (ProcedureLimits(tension=4e-4, friction_nodes=9), ProcedureLimits(tension=1e-4, friction_nodes=2))
-    planner = NeedlePlanner(hernia.scene, hernia.coils.needle().kinematics, hernia.coils.keep_out, 0.05)
-    extremes, thread = RunExtremes(planner, hernia.scene, limits, None), np.array([[0.008, -0.0145], [0.007, -0.0145]])
-
-    def pursue(goal: int, tension: float, nodes: int) -> tuple[float, int]:
-        condition = ThreadCondition(friction_nodes=nodes)
-        extremes.update(LoopFrame(1.0, thread[0], 0.0, thread, tension, condition, np.zeros(2), ""), True, goal, None)
-        return extremes.figures.max_tension_excess_n, extremes.figures.max_friction_excess
-
-    assert pursue(0, 3e-4, 9) == pytest.approx((-1e-4, 0))
-    assert pursue(1, 0.5e-4, 1) == pytest.approx((-0.5e-4, 0))
-    assert pursue(1, 1.5e-4, 4) == pytest.approx((0.5e-4, 2))
-    assert pursue(0, 0.0, 0) == pytest.approx((0.5e-4, 2))  # the maximum stays
 
 
 def test_the_files_of_each_seed_do_not_depend_on_the_number_of_processes(

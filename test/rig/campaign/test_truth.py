@@ -44,7 +44,6 @@ def around(degrees: float) -> np.ndarray:
         ([-2e-3, 1e-3], []),
         ([-2e-3, 1e-3, -1e-3, 2e-3], []),
         ([1e-3, 2e-3], ["0 net crossings between a and b"]),
-        ([1e-3, -1e-3, 1e-3], ["0 net crossings between a and b"]),
         ([2e-3, -1e-3], ["-1 net crossings between a and b"]),
     ],
 )
@@ -87,18 +86,14 @@ def test_a_lost_wrap_is_named_whatever_follows_it():
     [
         ({"wind": {"around": "b", "angle": 5.0}}, around(290.0), ""),
         ({"wind": {"around": "b", "angle": 5.0}}, around(350.0), "winds 350 of"),
-        ({"unwind": {"around": "b"}}, around(170.0), ""),
         ({"unwind": {"around": "b"}}, around(200.0), "winds 200 of -180 to 180"),
         ({"take_off": {"around": "b"}}, around(90.0), "0.20 mm from b"),
         ({"keep_side": {"around": "b", "side": "right", "to": [0.0, 0.008]}}, around(90.0), ""),
-        ({"keep_side": {"around": "b", "side": "left", "to": [0.0, 0.008]}}, around(90.0), "winds 90 of"),
         ({"keep_side": {"around": "b", "side": "right", "to": [0.0, 0.004]}}, around(90.0), "4.00 mm from its place"),
         (LINE, around(90.0), ""),
         ({"lay": {**LINE["lay"], "tolerance": 3e-4}}, around(90.0), "mm off its line"),
         ({"lay": {**LINE["lay"], "stretch": [0.0, 0.002]}}, around(90.0), "mm off its line"),
-        ({"bring_end": {"position": [0.004, 0.0022]}}, around(90.0), "mm from its place"),
         ({"bring_end": {"position": [0.0062, 0.0]}}, around(90.0), ""),
-        ({"wait": {"time": 1.0}}, around(90.0), ""),
     ],
 )
 def test_goals_of_the_thread_are_compared_with_the_thread(goal: dict[str, Any], thread: np.ndarray, words: str):

@@ -6,7 +6,6 @@ import itertools
 import math
 import os
 import select
-import struct
 import threading
 import time
 import tty
@@ -23,7 +22,6 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig import power as packets
 from magnetosuture_thread.rig.power import RoboClawBoard
 
-SUPPLY = packets.answer(128, packets.Command.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
 
 
@@ -99,23 +97,15 @@ def wait_for(port: ExchangePort, answer_timeout: float) -> None:
     port.timeout = port.answer_timeout = answer_timeout
 
 
-@pytest.fixture
-def patient(port: ExchangePort) -> None:
-    """Give boards that do answer all the time they may need on a busy machine."""
-    wait_for(port, 1.0)
-
-
-def board(port: ExchangePort, tenths: int = 2, hurries: bool = False) -> Board:
+def board(port: ExchangePort) -> Board:
     """Return the board on a line."""
-    return Board(
-        port, 0, 128, "board 0", CoilBridgeSettings(driver_timeout=0.1 * tenths, max_speed=0.005), lambda: hurries
-    )
+    settings = CoilBridgeSettings(driver_timeout=0.2, max_speed=0.005)
+    return Board(port, 0, 128, "board 0", settings, lambda: False)
 
 
-def simulated(made: RoboClawBoard, step: float | None = None) -> Callable[[bytes], bytes]:
-    """Return what answers as a board does; with a step, each packet comes so much later than the last [s]."""
-    steps = itertools.count(1)
-    return lambda packet: made.receive(packet, time.monotonic() if step is None else step * next(steps))
+def simulated(made: RoboClawBoard) -> Callable[[bytes], bytes]:
+    """Return what answers as a board does."""
+    return lambda packet: made.receive(packet, time.monotonic())
 
 
 def test_an_acknowledgement_that_came_too_late_is_not_one_for_the_next_command(peer, port):
@@ -181,21 +171,6 @@ def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_late
     made.write(lambda: next(commanded))
     assert not there.timeline
     assert there.heard > expires
-
-
-def test_a_second_attempt_takes_what_is_newest(peer, port):
-    wait_for(port, 0.5)
-    replies = iter([b"", SUPPLY, b"\xff"])
-    peer.answer(lambda _: next(replies))
-    made = board(port)
-    made.voltage = 24.0
-    newest = iter([(np.array([3.0, -6.0]), math.inf), (None, math.inf)])  # stopped after the first
-    made.write(lambda: next(newest))
-    assert [packet[2:6] for packet in peer.heard if packet[1] == packets.Command.SET_DUTIES] == [
-        struct.pack(">hh", 4095, -8191),
-        bytes(4),
-    ]
-    assert made.warnings == ()
 
 
 def test_an_exchange_ends_however_slowly_bytes_come(peer, port):

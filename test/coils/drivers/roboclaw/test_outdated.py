@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import select
 import time
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-
-from magnetosuture_thread.coils.drivers import roboclaw as board
 
 CURRENTS = np.array([3.0, -6.0, 1.5, 2.0])
 
@@ -32,19 +27,3 @@ def test_currents_that_were_computed_long_ago_are_zero(bench, timeouts: dict[str
     driver = bench.open(**timeouts)
     driver.apply(CURRENTS, time.monotonic() - 0.45)
     assert duties_during(bench, 0.3) == {(0, 0)}
-
-
-def test_currents_that_grow_old_before_their_packet_is_written_are_zero(bench, monkeypatch: pytest.MonkeyPatch):
-    """As where the thread of the line is stopped between looking at their age and writing."""
-    driver = bench.open(apply_timeout=0.1, roboclaw_answer_timeout=1.0, driver_timeout=1.0)
-    real = select.select
-
-    def stopped(*waited: Any) -> Any:
-        time.sleep(0.15)
-        return real(*waited)
-
-    monkeypatch.setattr(board, "select", SimpleNamespace(select=stopped))
-    for _ in range(4):
-        driver.apply(CURRENTS, time.monotonic())
-        assert duties_during(bench, 0.5) == {(0, 0)}
-    assert driver.state().ready
