@@ -25,7 +25,8 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [README, *DOCS]
-ALL = [*PAGES, *(ROOT / f"{name}.md" for name in ("CONTRIBUTING", "CHANGELOG", "QUALITY_DECLARATION"))]
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
+ALL = [*PAGES, CONTRIBUTING, *(ROOT / f"{name}.md" for name in ("CHANGELOG", "QUALITY_DECLARATION"))]
 SCRIPTS = set(re.findall(r'^(\w+) = "magnetosuture_thread\.', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
 TARGETS = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 LAUNCH_ARGUMENTS = set(re.findall(r'argument\("(\w+)"', (ROOT / "launch/magnetosuture.launch.py").read_text()))
@@ -134,6 +135,14 @@ def test_links_resolve(page: Path):
         assert path.is_relative_to(ROOT), target
         assert path.exists(), target
         assert not anchor or anchor in anchors(path), target
+
+
+def test_files_of_the_source_tree_that_pages_name_exist():
+    """Those by a path from its root: `test/...`, `config/...`."""
+    folders = "benchmarks|config|docs|examples|launch|magnetosuture_thread|msg_defs|test"
+    for page in [*PAGES, CONTRIBUTING]:
+        for path in re.findall(rf"`((?:{folders})/[\w./-]+)`", prose(page)):
+            assert (ROOT / path).exists(), (page.name, path)
 
 
 def test_every_page_and_picture_is_reached():
