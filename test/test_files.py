@@ -13,7 +13,6 @@ from rosbags.rosbag2 import StoragePlugin
 
 from magnetosuture_thread import ConfigurationError, cli
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.commands.command import make_console, make_table
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.settings.errors import BagError
@@ -27,8 +26,6 @@ from magnetosuture_thread.settings.files import (
     whole_folder,
 )
 from test.bags.bags import STRING, read, texts, write_mcap, write_rosbag
-
-NASTY = "a\x1b[31m\u202eb\x9b1m"
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
@@ -181,10 +178,3 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
         with pytest.raises(KeyboardInterrupt), output:
             raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
-
-
-def test_no_name_reaches_the_terminal_raw(capsys: pytest.CaptureFixture[str]):
-    make_console().print(make_table(NASTY, (NASTY,), [(NASTY,)]))
-    shown = capsys.readouterr().out
-    assert not set(shown) & {"\x1b", "\u202e", "\x9b"}
-    assert r"\x1b" in shown

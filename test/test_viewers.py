@@ -14,7 +14,6 @@ from magnetosuture_msgs.msg import BarrierMargin
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.settings.interface import DISH_FRAME
 
 ROOT = Path(__file__).parent.parent
 VIEWERS = ROOT / "config" / "viewers"
@@ -41,21 +40,6 @@ def test_rviz_shows_what_is_there(display: dict[str, Any]):
         assert topic.qos.reliability == ReliabilityPolicy.RELIABLE
     if asked["Durability Policy"] == "Transient Local":
         assert topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-
-
-def test_both_look_at_the_dish():
-    assert RVIZ["Global Options"]["Fixed Frame"] == DISH_FRAME
-    assert RVIZ["Views"]["Current"]["Target Frame"] == RVIZ["Displays"][0]["Reference Frame"] == "<Fixed Frame>"
-    assert FOXGLOVE["configById"]["3D!dish"]["followTf"] == DISH_FRAME
-
-
-def panels(layout: Any) -> set[str]:
-    """Return the panels of a layout."""
-    return {layout} if isinstance(layout, str) else panels(layout["first"]) | panels(layout["second"])
-
-
-def test_every_panel_of_foxglove_has_its_settings():
-    assert panels(FOXGLOVE["layout"]) == set(FOXGLOVE["configById"])
 
 
 def fields_of(message: Any, path: str) -> bool:

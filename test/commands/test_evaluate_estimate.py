@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import packed_path
-from magnetosuture_thread.bags.reader import RecordedMessage
-from magnetosuture_thread.bags.reading import path_points, stamp_of
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.rig.setups import read_setup
-from magnetosuture_thread.settings.interface import MEASURED_THREAD
-from test.bags.bags import changed
 from test.conftest import arc
 
 SETUP = read_setup("petri_35mm_polyamide")
-STRAIGHT = """
-/**: {ros__parameters: {scene: dish_35mm, thread_length: 0.019}}
-/**/thread_model: {ros__parameters: {initial_shape: straight}}
-"""
 FRAMES = 60
 NAMES = [f"error_{of}_{which}_percent" for of in ("ground_truth", "measured") for which in ("mean", "max", "max_node")]
 
@@ -41,21 +30,6 @@ def pushed_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pushed") / "pushed"
     render_bag(reference, SETUP, path, pose_noise=1e-5)
     return path
-
-
-def with_paths(bag: Path, folder: Path, change: Callable[[int, np.ndarray], np.ndarray | None]) -> Path:
-    """Write a bag again, each measured centreline as it comes out of a function of its number and points."""
-    numbers: dict[int, int] = {}
-
-    def measured(old: RecordedMessage, message: Any) -> Any:
-        if old.topic != MEASURED_THREAD.recorded:
-            return message
-        points = change(numbers.setdefault(stamp_of(old), len(numbers)), path_points(message, old.topic))
-        if points is None:
-            return None
-        return typestore().deserialize_cdr(packed_path(stamp_of(old), points), MEASURED_THREAD.type_name)
-
-    return changed(bag, folder, measured)
 
 
 def evaluated(bag: Path, folder: Path, **selection: Any) -> dict[str, Any]:
@@ -82,26 +56,3 @@ def test_a_whole_path_corrects_what_the_model_does_not_know(tmp_path: Path, push
     low, high = row["consistency"]["band_95_low"], row["consistency"]["band_95_high"]
     assert 0.8 < low < 1.0 < high < 1.2
     assert row["disturbances"] > 0
-
-
-def test_a_path_that_ends_early_is_a_part_and_hides_the_rest(tmp_path: Path, pushed_bag: Path):
-    bag = with_paths(pushed_bag, tmp_path / "early", lambda k, points: points[:40] if k >= 30 else points)
-    row = evaluated(bag, tmp_path / "out")
-    assert row["hidden_time_share"] == pytest.approx(0.5, abs=0.02)
-    assert row["all_hidden_time_share"] == 0.0
-    assert row["hidden_length_share"] == pytest.approx(0.5 * 24 / 63, abs=0.01)
-    assert row["corrected_frames"] == FRAMES
-    # A whole thread of 62 % of the length would be bent to fit into the part.
-    assert row["estimate"]["error_ground_truth_max_percent"] < row["prediction"]["error_ground_truth_max_percent"]
-
-
-def test_without_a_measurement_the_estimate_is_the_prediction_and_says_so(tmp_path: Path, pushed_bag: Path):
-    setup = tmp_path / "straight.yaml"
-    setup.write_text(STRAIGHT)
-    blind = with_paths(pushed_bag, tmp_path / "blind", lambda k, points: None)
-    row = evaluated(blind, tmp_path / "out", setup_name=str(setup))
-    assert row["estimate"] == row["prediction"]
-    assert row["estimate"]["error_ground_truth_mean_percent"] > 0.0
-    assert row["estimate"]["error_measured_mean_percent"] is None
-    assert (row["corrected_frames"], row["all_hidden_time_share"], row["disturbances"]) == (0, 1.0, 0)
-    assert row["consistency"]["normalised_innovation_squared_mean"] is None

@@ -68,13 +68,6 @@ def test_a_bag_without_a_scene_has_that_of_its_setup(copied: Copy):
         assert found.setup.scene == read_scene("dish_35mm_post")
 
 
-def test_the_scene_is_the_one_that_was_in_force_at_the_start(copied: Copy):
-    path = copied((0.0, Scene()), (0.4, POST), setup=OWN)
-    for start, scene in ((0.0, Scene()), (0.3, Scene()), (0.6, POST)):
-        with given(path, start=start) as found:
-            assert found.setup.scene == scene
-
-
 def test_a_damaged_scene_is_refused(copied: Copy):
     with (
         pytest.raises(BagError, match=r"scene\.version: got '0123', expected"),

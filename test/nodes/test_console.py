@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -15,7 +13,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.geometry.scene_files import read_scene
@@ -25,10 +22,7 @@ from magnetosuture_thread.nodes.clients import Participant
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
-from magnetosuture_thread.nodes.processes import graph_environment
 from test.nodes import wire
-
-SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
 
 @pytest.fixture
@@ -197,25 +191,3 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     assert commands == []
     console.blocked = "starting"
     assert asyncio.run(console.execute_procedure("plan", near, False)) == "starting"
-
-
-def test_the_node_serves_the_page_and_answers_the_services_of_its_parameters(graph, programs):
-    process = programs.start("console", "-p", "port:=0", environment=graph_environment(graph.domain))
-    process.wait_for("/#token=")
-    found = re.search(r"http://127\.0\.0\.1:\d+/", process.output)
-    assert found is not None
-    with urllib.request.urlopen(found[0], timeout=10.0) as page:
-        assert page.status == 200
-    client = AsyncParameterClient(graph.probe, "console")
-    graph.wait(client.services_are_ready, "the parameter services")
-    answers = [client.get_parameters(["port"])]
-
-    def answered() -> bool:
-        if time.monotonic() > asked + len(answers):  # an answer may be lost before the two have found each other
-            answers.append(client.get_parameters(["port"]))
-        return any(answer.done() for answer in answers)
-
-    asked = time.monotonic()
-    graph.wait(answered, "an answer")
-    (values, *_) = (answer.result().values for answer in answers if answer.done())
-    assert [value.integer_value for value in values] == [0]

@@ -18,7 +18,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.serialization import serialize_message
-from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.bags import markers, packing, reading
 from magnetosuture_thread.bags.message_types import typestore
@@ -123,7 +122,6 @@ MARGINS = Margins(
 )
 PACKED = {
     "pose": (interface.NEEDLE_POSE, packing.packed_pose(7, TAIL, HEADING, np.eye(3))),
-    "pose before 1970": (interface.NEEDLE_POSE, packing.packed_pose(-7, TAIL, HEADING)),
     "setpoint": (interface.TIP_SETPOINT, packing.packed_pose_stamped(7, TAIL, 0.3)),
     "point": (interface.NEEDLE_TIP, packing.packed_point(7, TAIL)),
     "twist": (interface.NEEDLE_COMMAND, packing.packed_twist(7, TAIL)),
@@ -136,10 +134,8 @@ PACKED = {
     "tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "glare", VIEW))),
     "blind tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "", None))),
     "observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, observation(3, 64))),
-    "empty observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, ThreadObservation())),
     "prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction((0, 3)), "silk")),
     "free prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction(), "")),
-    "estimate": (interface.ESTIMATED_THREAD, packing.packed_estimate(7, an_estimate())),
     "disturbed": (interface.ESTIMATED_THREAD, packing.packed_estimate(7, an_estimate(2))),
     "margins": (interface.MARGINS, packing.packed_margins(7, MARGINS)),
     "no margins": (interface.MARGINS, packing.packed_margins(7, None, "for a reason", "0123456789abcdef")),
@@ -267,11 +263,9 @@ BROKEN: dict[str, Callable[[Any], None]] = {
     "other deviations": lambda m: setattr(m.pieces[0], "deviation", m.pieces[0].deviation[:-1]),
     "a point that is none": lambda m: setattr(m.pieces[0].points[1], "x", math.nan),
     "an end that is none": lambda m: setattr(m.pieces[0], "last_end", 9),
-    "half an interval": lambda m: setattr(m.pieces[0], "arc_length_max", math.nan),
     "complete in two pieces": lambda m: setattr(m, "complete", True),
     "too many pieces": lambda m: setattr(m, "pieces", m.pieces[:1] * (reading.MAX_PIECES + 1)),
     "an outline that is none": lambda m: setattr(m.hidden[0], "corners", m.hidden[0].corners[:2]),
-    "another frame": lambda m: setattr(m.header, "frame_id", "camera"),
 }
 
 
@@ -299,22 +293,6 @@ def test_margins_of_an_estimate_have_bounds_and_go_there_and_back():
         assert least["connectivity"] == -math.inf
     none = topics.MARGINS.decode(packing.packed_margins(7, None, "no pose"))
     assert (none.valid, none.source, none.reason) == (False, SafetyMargins.OF_NOTHING, "no pose")
-
-
-def test_markers_show_the_estimate_beside_the_prediction():
-    estimate = an_estimate(2)
-    predicted = replace(estimate.prediction, positions=estimate.positions + 1e-3)
-    data = markers.packed_thread_markers(7, predicted, estimate.margins, 1e-4, estimate)
-    shown = topics.THREAD_MARKERS.decode(data).markers
-    lines = {each.ns: each for each in shown if each.id == 0}
-    for name, nodes in (("thread", estimate.positions), ("predicted", predicted.positions)):
-        np.testing.assert_array_equal([[point.x, point.y] for point in lines[name].points], nodes)
-    assert len(lines["deviation"].points) == 6 * 6
-    forces = [each for each in shown if each.ns == "disturbances"]
-    assert [each.type for each in forces] == [Marker.ARROW, Marker.TEXT_VIEW_FACING] * 2
-    assert (forces[0].points[1].x, forces[0].points[1].y) == (0.0, -0.5)
-    alone = topics.THREAD_MARKERS.decode(markers.packed_thread_markers(7, None, None, 1e-4, estimate))
-    assert {each.ns for each in alone.markers} == {"thread", "deviation", "disturbances"}
 
 
 def test_the_minimum_of_every_barrier_is_written_beside_its_node():
