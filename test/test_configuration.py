@@ -11,7 +11,7 @@ import pytest
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.parameter_files import key_matches, load_setup
+from magnetosuture_thread.settings.parameter_files import load_setup
 
 
 @dataclass(frozen=True)
@@ -144,19 +144,3 @@ def test_sections_are_for_whom_ros_has_them(tmp_path: Path, text: str, kettle: f
     path.write_text(text)
     loaded = load_setup(path, [Kettle, Pot])
     assert (loaded["kettle"].viscosity, loaded["pot"].viscosity) == (kettle, pot)
-
-
-@pytest.mark.parametrize(
-    ("key", "node", "is_for"),
-    [
-        ("/**", "/kettle", True),
-        ("/**/kettle", "/a/b/kettle", True),
-        ("/**/kettle", "/a/kettle_2", False),
-        ("/kettle", "/a/kettle", False),
-        ("/*/kettle", "/a/kettle", True),
-        ("/a/*", "/a/b/kettle", False),
-        ("/a.c/kettle", "/abc/kettle", False),
-    ],
-)
-def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
-    assert key_matches(key, node) == is_for

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -51,17 +50,6 @@ def fields_of(message: Any, path: str) -> bool:
         if isinstance(message, list):  # of another type of ours
             message = BarrierMargin()
     return True
-
-
-def test_the_documented_line_writes_foxgloves_layout_for_a_rig_with_a_namespace_and_prefix():
-    page = (ROOT / "docs" / "how_to" / "several_rigs.md").read_text()
-    (line,) = re.findall(r"^    (sed .+) > left\.json$", page, re.MULTILINE)
-    done = subprocess.run(line, shell=True, cwd=VIEWERS, capture_output=True, text=True, check=True)
-    layout = json.loads(done.stdout)
-    assert layout["configById"]["3D!dish"]["followTf"] == "left/dish"
-    assert layout["configById"]["DiagnosticSummary!nodes"] == FOXGLOVE["configById"]["DiagnosticSummary!nodes"]
-    given, written = (re.findall(r'"(/[^" ]+)', json.dumps(each)) for each in (FOXGLOVE, layout))
-    assert written == [name if name == "/diagnostics" else f"/left{name}" for name in given]
 
 
 def test_foxglove_shows_what_is_there():

@@ -33,6 +33,8 @@ def test_a_bag_gets_a_picture_and_a_row(tmp_path: Path, short_bag: Path):
     assert (row["frames"], row["predicted"], row["problem"]) == (30, 28, "")
     assert 0.0 < float(str(row["error_truth_mean_percent"])) < 1.0
     assert 0.0 < float(str(row["error_seen_mean_percent"])) < 1.0
+    assert 0.0 < row["estimate"]["error_ground_truth_mean_percent"] < 1.0
+    assert row["prediction"]["error_ground_truth_mean_percent"] == row["error_truth_mean_percent"]
     assert row["recorded_error_truth_frames"] == 0
     assert json.loads((tmp_path / "out" / "table.json").read_text())["bags"] == [row]
     assert (tmp_path / "out" / "pull.png").read_bytes().startswith(b"\x89PNG")
@@ -87,11 +89,6 @@ def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_ba
     assert row["latency_frame_to_prediction_median_s"] == pytest.approx(0.02)
     assert row["latency_command_to_currents_median_s"] is None
     assert row["simulated"] == ""
-
-
-def test_against_and_formulation_are_as_asked_for(tmp_path: Path, short_bag: Path):
-    (row,) = evaluate_bags([short_bag], tmp_path / "out", against="seen", formulation="paper", duration=0.4)
-    assert (row["error_truth_frames"], row["formulation"]) == (0, "paper")
 
 
 def test_what_is_wrong_for_all_bags_is_said_at_once(tmp_path: Path, short_bag: Path):

@@ -56,7 +56,7 @@ def given(path: Path, setup_name: str = "", start: float = 0.0) -> AbstractConte
     return open_bag(path, print, setup_name=setup_name, start=start)
 
 
-def test_the_bags_own_scene_counts_whatever_the_setup_says(copied: Copy):
+def test_the_bags_own_scene_counts_before_that_of_any_setup(copied: Copy):
     path = copied((0.0, POST), setup=OWN)
     for name, expected in (("", OWN), ("petri_150mm_silk", "petri_150mm_silk")):
         with given(path, setup_name=name) as found:

@@ -124,32 +124,6 @@ def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
     drive_until(graph, lambda: driven(node), "a good command")
 
 
-@pytest.mark.parametrize("offset_ms", [-300, 300])
-def test_the_offset_of_another_hosts_clock_is_measured_and_its_commands_refused(graph, offset_ms):
-    node = armed(graph, pose_timeout=1.0)
-    diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
-
-    def age_of(topic: str) -> float:
-        values = {each.key: each.value for each in diagnostics[-1].status[0].values} if diagnostics else {}
-        return float(values.get(f"minimum age of {topic} [ms]", "inf"))
-
-    def minimum_age() -> float:
-        graph.publish(topics.NEEDLE_COMMAND, wire.twist_message(shifted(graph.now(), offset_ms), EAST))
-        return age_of("needle/servo_cv")
-
-    # The age has the transport in it, which on a busy machine takes its time.
-    graph.wait(lambda: -offset_ms <= minimum_age() < 250 - offset_ms, "the offset")
-    assert math.isnan(age_of("operator/servo_cv"))  # nobody commands there
-    assert not driven(node)
-
-
-def shifted(stamp: Time, milliseconds: int) -> Time:
-    """Return a stamp of a clock that is ahead."""
-    nanoseconds = stamp.sec * 10**9 + stamp.nanosec + milliseconds * 10**6
-    return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-
-
 @pytest.mark.parametrize("damaged", [True, False], ids=["damaged", "no room"])
 def test_a_scene_that_is_refused_stops_the_needle_until_a_good_one_comes(graph, damaged: bool):
     """The setup's scene goes on to be in force, but nobody knows whether it still is what stands in the dish."""

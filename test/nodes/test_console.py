@@ -89,7 +89,7 @@ def known_part(console: ConsoleGraph, name: str) -> object:
 
 def test_the_axis_of_a_needle_is_told_and_a_point_at_its_tip_is_published(graph, console):
     tips, tail = graph.listen(topics.NEEDLE_TIP), np.array([0.002, -0.001])
-    for deviation, known, unknown in ((10.0, "axis", "needle"), (0.1, "needle", "axis"), (np.inf, "axis", "needle")):
+    for deviation, known, unknown in ((0.1, "needle", "axis"), (np.inf, "axis", "needle")):
         pose = wire.pose_message(graph.now(), tail, np.array([1.0, 0.0]), np.diag([1e-9, 1e-9, deviation**2]))
         tell(graph, topics.NEEDLE_POSE, pose, partial(known_part, console, known), known)
         assert console.state()[known]["tail"] == pytest.approx(tail)
@@ -173,7 +173,6 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
         return (state["procedure"] or {}).get("state") == "ready" and len(state["plan"]) > 10
 
     graph.wait(is_shown, "state and plan")
-    assert console.state()["procedure"]["goals"] == ["go_to"]
     assert asyncio.run(console.execute_procedure("resume", "", False)) == ""
 
     def is_in(state: str, reason: str) -> bool:

@@ -22,27 +22,17 @@ from rclpy.serialization import serialize_message
 from magnetosuture_thread.bags import markers, packing, reading
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.scene_message import packed_scene
-from magnetosuture_thread.coils import bridge
-from magnetosuture_thread.coils import filter as safety
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
-from magnetosuture_thread.forecast import rollout
-from magnetosuture_thread.geometry.barrier import BUILT_IN, WALL
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.scene import KINDS
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
-from magnetosuture_thread.planning.procedure import GOALS
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.thread import predictor
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
-from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread.prediction import Prediction
-from magnetosuture_thread.thread.solvers import SOLVERS
 from magnetosuture_thread.vision.tracker import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 from test.geometry.scene.scenes import every_shape
@@ -189,31 +179,6 @@ def test_the_frames_of_a_rig_with_a_prefix_are_its_own(prefix: str):
     assert (done.returncode, done.stdout) == (0, f"{prefix}dish {prefix}camera\n"), done.stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "prefix", "words"),
-    [
-        ("BarrierMargin", "", set(BUILT_IN)),
-        ("ThreadForecast", "MARGIN_", set(rollout.KINDS) - set(BUILT_IN)),
-        ("SceneShape", "KIND_", set(KINDS)),
-        ("ThreadMaterial", "ATTACHMENT_", {each.value for each in Attachment}),
-        ("FilterState", "SOURCE_", set(bridge.INPUTS)),
-        ("FilterState", "ACTIVE_", {safety.FRICTION, safety.SPEED, safety.ACCELERATION, WALL}),
-        ("PredictedThread", "FORMULATION_", set(predictor.FORMULATIONS)),
-        ("PredictedThread", "SOLVER_", set(SOLVERS)),
-        (
-            "CoilBridgeState",
-            "DRIVER_",
-            {*CoilBridgeSettings.__dataclass_fields__["driver"].metadata["quantity"].choices, "none"},
-        ),
-        ("ProcedureState", "GOAL_", set(GOALS)),
-    ],
-)
-def test_the_texts_that_messages_may_have_are_constants_of_their_definitions(name: str, prefix: str, words: set[str]):
-    constants = typestore().fielddefs[f"magnetosuture_msgs/msg/{name}"][0]
-    found = {each[0]: each[2] for each in constants if each[1] == "string" and each[0].startswith(prefix)}
-    assert found == {f"{prefix}{word.upper()}": word for word in words}
-
-
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
 def test_a_pose_goes_there_and_back_also_without_a_message(angle: float, x: float, y: float):
     tail, heading = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
@@ -293,19 +258,6 @@ def test_margins_of_an_estimate_have_bounds_and_go_there_and_back():
         assert least["connectivity"] == -math.inf
     none = topics.MARGINS.decode(packing.packed_margins(7, None, "no pose"))
     assert (none.valid, none.source, none.reason) == (False, SafetyMargins.OF_NOTHING, "no pose")
-
-
-def test_the_minimum_of_every_barrier_is_written_beside_its_node():
-    """Also of a barrier that a user added; not of those that hold the segments together, nor of one without rows."""
-    data = markers.packed_thread_markers(7, prediction(), MARGINS, 1e-4)
-    texts = [each for each in topics.THREAD_MARKERS.decode(data).markers if each.ns == "margins"]
-    assert [each.text for each in texts] == ["obstacle -0.00 mm", "own 1.20 mm"]
-    assert texts[0].color.r > texts[1].color.r  # red where it is touched
-    for each, node in zip(texts, (3, 2), strict=True):
-        assert each.pose.position.x == POINTS[node, 0]
-        assert each.lifetime.nanosec > 0  # it goes when the barrier has no row any more
-    hidden = topics.THREAD_MARKERS.decode(markers.packed_thread_markers(7, prediction(), None, 1e-4))
-    assert {each.ns for each in hidden.markers} == {"thread"}
 
 
 def test_the_bags_and_the_graph_have_the_same_own_messages():

@@ -252,29 +252,27 @@ def test_what_is_not_known_pauses_and_it_goes_on_by_itself_once_it_is(graph, mak
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
-@pytest.mark.parametrize("tracker", ["", "two needles"])
-def test_without_poses_it_pauses(graph, make_bench, tracker: str):
+SILENT = "no needle pose for more than 0.2 s"
+
+
+@pytest.mark.parametrize(
+    ("without", "reason"),
+    [("silent", SILENT), ("late", SILENT), ("lost", "the needle is not tracked: two needles")],
+)
+def test_without_poses_it_pauses(graph, make_bench, without: str, reason: str):
+    """Late ones are as none: their commands would be stamped as of now."""
     bench = make_bench(pose_timeout=0.2)
-    goal = bench.run()
-    if tracker:
-        graph.publish(topics.TRACKER_STATE, TrackerState(state=TrackerState.STATE_LOST, reason=tracker))
-    reason = f"the needle is not tracked: {tracker}" if tracker else "no needle pose for more than 0.2 s"
+    goal, ahead = bench.run(), bench.begin
+    if without == "lost":
+        graph.publish(topics.TRACKER_STATE, TrackerState(state=TrackerState.STATE_LOST, reason="two needles"))
+    if without == "late":
+        bench.begin = int(time.time()) - 3600
+        bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
     graph.wait(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
-    assert not bench.commands[-1].twist.linear.x
-    bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
-    assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
-
-
-def test_late_poses_are_as_none(graph, make_bench):
-    """As where two hosts' clocks differ, or a network holds them back: their commands would be stamped as of now."""
-    bench = make_bench(pose_timeout=0.2)
-    bench.run()
-    ahead, bench.begin = bench.begin, int(time.time()) - 3600
-    reason = "no needle pose for more than 0.2 s"
-    bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
     assert not bench.commands[-1].twist.linear.x
     bench.begin = ahead
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
+    assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
 def test_a_bridge_that_is_disarmed_pauses_until_it_is_resumed(graph, make_bench):

@@ -6,8 +6,6 @@ import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
 
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
@@ -106,19 +104,3 @@ def test_a_fault_can_be_asked_for_now(graph):
     graph.publish(topics.FAULT_REQUEST, String(data="sunshine 60"))
     graph.wait(lambda: any("expected KIND DURATION" in text for text in refusals(diagnostics)), "a refusal")
     assert [fault.kind for fault in node.rig.faults.faults] == ["glare"]
-
-
-def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):
-    node = graph.add(RigSimulatorNode, **SMALL)
-    frames, diagnostics = graph.listen(topics.CAMERA_INFO), graph.listen(topics.DIAGNOSTICS)
-    graph.wait(lambda: bool(frames), "a frame")
-    before = frames[-1].k[0]
-    other = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.002)),))
-    graph.publish(topics.SCENE, wire.scene_message(0, other))
-    graph.wait(lambda: node.rig.scene.version == other.version, "the other scene")
-    graph.wait(lambda: frames[-1].k[0] < 0.9 * before, "a frame of the wider dish")
-    on_needle = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.006, 0.0), 0.002)),))
-    graph.publish(topics.SCENE, wire.scene_message(0, on_needle))
-    refusal = "scene: got post where the needle is"  # the message may be that of the next frame already
-    graph.wait(lambda: any(refusal in text for text in refusals(diagnostics)), "the refusal")
-    assert node.rig.scene.version == other.version
