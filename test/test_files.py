@@ -37,14 +37,6 @@ def test_what_is_no_regular_file_is_not_even_opened(tmp_path: Path, kind: str, m
         read_regular(path)
 
 
-def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path):
-    path = tmp_path / "file"
-    path.write_bytes(bytes(100))
-    assert read_regular(path, 100) == bytes(100)
-    with pytest.raises(OSError, match="a larger file"):
-        read_regular(path, 99)
-
-
 BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
 
 

@@ -71,16 +71,6 @@ def test_every_message_is_built():
         assert listed == {path.stem for path in (ROOT / "msg_defs" / kind).glob(f"*.{kind}")}
 
 
-def test_every_message_package_that_the_nodes_import_is_declared():
-    declared = {entry.text for entry in package_xml(ROOT / "package.xml").findall("depend")}
-    used = set()
-    for path in (ROOT / "magnetosuture_thread" / "nodes").rglob("*.py"):
-        used |= set(re.findall(r"^from (\w+)\.(?:msg|srv|action) import", path.read_text(), re.MULTILINE))
-    interface = (ROOT / "magnetosuture_thread" / "settings" / "interface.py").read_text()
-    used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))
-    assert used <= declared
-
-
 def test_every_import_has_a_key_of_rosdep_or_is_in_the_list_for_pip():
     keys = {entry.text for tag in ("depend", "exec_depend") for entry in package_xml(ROOT / "package.xml").iter(tag)}
     line = re.search(r"^ +pip install --break-system-packages (.+)$", INSTALLATION, re.MULTILINE)

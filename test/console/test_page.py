@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, Position, ViewportSize, expect
+from playwright.sync_api import Browser, Page, ViewportSize, expect
 
 from test.console.conftest import ServedConsole
 from test.console.scene import TAIL, estimated_state, forecast_state, picture, state
@@ -18,7 +18,8 @@ from test.console.scene import TAIL, estimated_state, forecast_state, picture, s
 pytestmark = pytest.mark.slow
 
 WAIT_TIMEOUT = 15.0  # [s]
-REST = (0.0, 0.0)
+REST, EAST = (0.0, 0.0), (0.003, 0.0)
+TIP = (TAIL[0] + 0.007, TAIL[1])  # m
 LAPTOP, PHONE = ViewportSize(width=1366, height=768), ViewportSize(width=390, height=844)
 ON_TOP = """(id) => {
     const element = document.getElementById(id), box = element.getBoundingClientRect();
@@ -67,6 +68,20 @@ class Operator:
         self.page.click("#control")
         expect(self.page.locator("#holder")).to_have_text("you have control")
 
+    def hold(self) -> None:
+        """Take control and hold a key, and wait until the needle is commanded to the east."""
+        self.take_control()
+        self.page.keyboard.down("ArrowRight")
+        self.last(EAST)
+
+    def tip(self) -> tuple[float, float]:
+        """Return where the needle's tip is on the screen [px]."""
+        dish = self.page.locator("#dish")
+        box, scale = dish.bounding_box(), float(dish.get_attribute("data-scale") or 0)
+        assert box is not None
+        u, v = (float(entry) for entry in (dish.get_attribute("data-centre") or "").split(","))
+        return box["x"] + u + scale * TIP[0], box["y"] + v - scale * TIP[1]
+
     def last(self, velocity: tuple[float, float]) -> None:
         """Wait until this is the last command."""
         self.until(lambda: self.served.graph.last == pytest.approx(velocity, abs=1e-9))
@@ -111,16 +126,12 @@ def test_a_click_tells_which_end_of_the_needle_is_its_tip(operator: Operator):
     dish = operator.page.locator("#dish")
     expect(dish).to_have_attribute("data-axis", "yes")
     expect(operator.page.locator("#headline")).to_have_text("Which end of the needle is the tip?")
-    scale, ratio = float(dish.get_attribute("data-scale") or 0), operator.page.evaluate("devicePixelRatio")
-    u, v = (float(entry) / ratio for entry in (dish.get_attribute("data-centre") or "").split(","))
-    tip = (TAIL[0] + 0.007, TAIL[1])
-    place: Position = {"x": u + tip[0] * scale / ratio, "y": v - tip[1] * scale / ratio}
-    dish.click(position=place)  # without control
+    operator.page.mouse.click(*operator.tip())  # without control
     assert operator.served.graph.tips == []
     operator.take_control()
-    dish.click(position=place)
+    operator.page.mouse.click(*operator.tip())
     operator.until(lambda: operator.served.graph.tips)
-    assert operator.served.graph.tips == [pytest.approx(tip, abs=1e-4)]
+    assert operator.served.graph.tips == [pytest.approx(TIP, abs=1e-4)]
     expect(dish).to_have_attribute("data-axis", "no")
     assert operator.served.graph.commands == []
 
@@ -164,13 +175,8 @@ def test_gamepad_stick_jogs_after_it_was_centred(operator: Operator):
 
 def test_dragging_from_the_needle_jogs(operator: Operator):
     operator.take_control()
-    tip = TAIL[0] + 0.007, TAIL[1]  # m
-    box = operator.page.locator("#dish").bounding_box()
+    (x, y), mouse, box = operator.tip(), operator.page.mouse, operator.page.locator("#dish").bounding_box()
     assert box is not None
-    scale = float(operator.page.get_attribute("#dish", "data-scale") or 0)
-    u, v = (float(entry) for entry in (operator.page.get_attribute("#dish", "data-centre") or "").split(","))
-    x, y = box["x"] + u + scale * tip[0], box["y"] + v - scale * tip[1]
-    mouse = operator.page.mouse
     mouse.move(x + 150, y + 200)
     mouse.down()
     mouse.move(x + 160, y + 200)
@@ -193,23 +199,21 @@ def test_key_held_while_focus_is_lost_must_be_pressed_again(operator: Operator):
     operator.take_control()
     for lost in ("blur", "offline", "pagehide"):
         operator.page.keyboard.down("ArrowRight")
-        operator.last((0.003, 0.0))
+        operator.last(EAST)
         operator.page.evaluate(f"window.dispatchEvent(new Event('{lost}'))")
         operator.last(REST)
         operator.page.keyboard.down("ArrowRight")  # the browser repeats the key
         operator.nothing_more()
         operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.last(EAST)
     operator.page.context.set_offline(True)
     operator.last(REST)
     operator.page.context.set_offline(False)
 
 
 def test_hidden_tab_stops_the_needle_and_loses_control(operator: Operator):
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.hold()
     hide = "Object.defineProperty(document, '{}', {{value: {}, configurable: true}})"
     operator.page.evaluate(hide.format("hidden", "true"))
     operator.page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
@@ -219,9 +223,7 @@ def test_hidden_tab_stops_the_needle_and_loses_control(operator: Operator):
 
 
 def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.hold()
     operator.page.focus("#control")
     operator.page.keyboard.press("Space")
     operator.until(lambda: operator.served.graph.actions == ["stop"])
@@ -237,13 +239,11 @@ def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
     assert len(operator.served.graph.commands) == count
     operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.last(EAST)
 
 
 def test_lost_connection_stops_the_needle_and_control_is_not_resumed(operator: Operator):
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.hold()
     operator.served.tear()
     operator.last(REST)
     expect(operator.page.locator("#link")).to_contain_text("Connected as page 2")
@@ -252,7 +252,7 @@ def test_lost_connection_stops_the_needle_and_control_is_not_resumed(operator: O
     operator.nothing_more()
     operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.last(EAST)
 
 
 def test_without_the_token_every_control_is_off(browser: Browser, served: ServedConsole):
@@ -368,11 +368,7 @@ def test_the_ruler_measures_and_jogs_nothing(operator: Operator):
     operator.take_control()
     page, dish = operator.page, operator.page.locator("#dish")
     page.click("#ruler")
-    box = dish.bounding_box()
-    assert box is not None
-    scale = float(dish.get_attribute("data-scale") or 0)
-    u, v = (float(entry) for entry in (dish.get_attribute("data-centre") or "").split(","))
-    x, y = box["x"] + u + scale * (TAIL[0] + 0.007), box["y"] + v - scale * TAIL[1]  # the needle's tip
+    (x, y), scale = operator.tip(), float(dish.get_attribute("data-scale") or 0)
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x - 3.0 * RULER_STEP, y + 4.0 * RULER_STEP)

@@ -6,22 +6,17 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
+from rclpy.parameter import Parameter
 
 from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.nodes.parameters import plain_value
-from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import configuration_fields, to_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.files import find_file
 from test.test_configuration import Oven
 
 
@@ -118,35 +113,3 @@ def test_what_nodes_share_and_this_one_does_not_know_is_left_aside(graph):
     assert not node.has_parameter("viscosity")
     with pytest.raises(ConfigurationError, match=r"vision_tracker\.viscositee: got 0\.3"):
         graph.add(VisionTrackerNode, viscositee=0.3)
-
-
-def dumped(graph: Any, client: AsyncParameterClient, name: str) -> dict[str, Any]:
-    """Return what `ros2 param dump` writes of our parameters."""
-
-    def answer(future: Any) -> Any:
-        graph.wait(future.done, "an answer of a parameter service")
-        return future.result()
-
-    names = sorted(name for name in answer(client.list_parameters()).result.names if "." not in name)
-    values = map(parameter_value_to_python, answer(client.get_parameters(names)).values)
-    plain = (list(value) if hasattr(value, "typecode") else value for value in values)
-    return {name: {"ros__parameters": dict(zip(names, plain, strict=True))}}
-
-
-def test_parameters_that_are_dumped_are_loaded_again_and_started_with(graph, tmp_path: Path):
-    def started(file: Path) -> Any:
-        arguments = ["--ros-args", "--params-file", str(file)]
-        return graph.add(lambda context, **_: ThreadModelNode(context=context, cli_args=arguments))
-
-    node, file = started(find_file("setup", "hernia_ring")), tmp_path / "dumped.yaml"
-    name = node.get_fully_qualified_name()
-    client = AsyncParameterClient(graph.probe, name)
-    graph.wait(client.services_are_ready, "the parameter services")
-    values = dumped(graph, client, name)
-    file.write_text(yaml.safe_dump(values))
-    loaded = client.load_parameter_file(str(file))
-    graph.wait(loaded.done, "an answer")
-    reasons = [result.reason for result in loaded.result().results if not result.successful]
-    assert all(reason.startswith("Trying to set a read-only parameter") for reason in reasons)  # rclpy's own ones
-    graph.remove(node)
-    assert dumped(graph, client, started(file).get_fully_qualified_name()) == values

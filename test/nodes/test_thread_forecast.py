@@ -25,7 +25,6 @@ from magnetosuture_thread import (
 from magnetosuture_thread.bags.markers import forecast_text
 from magnetosuture_thread.bags.packing import packed_forecast
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import make_path_follower
 from magnetosuture_thread.settings.errors import InvalidInputError
@@ -62,21 +61,6 @@ def test_every_estimate_has_a_forecast_under_the_present_command(graph: Any, mon
     moved = math.hypot(message.tail[-1].x - message.tail[0].x, message.tail[-1].y - message.tail[0].y)
     assert moved == pytest.approx(0.004 * HORIZON, rel=0.05)
     graph.wait(lambda: any(marker.ns == "forecast" for each in markers for marker in each.markers), "markers")
-
-
-def test_a_forecast_that_is_worse_than_nothing_moves_is_withheld_with_the_reason(
-    graph: Any, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(PublishedForecasts, "judge", lambda own, estimate: "they are worse")
-    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
-    forecasts, reports = graph.listen(topics.FORECAST), graph.listen(topics.DIAGNOSTICS)
-    for k in range(3):
-        bench.show(k, whole(NODES[k], k))
-    graph.wait(
-        lambda: any("no forecast: they are worse" in each.message for report in reports for each in report.status),
-        "the reason",
-    )
-    assert not forecasts
 
 
 def test_a_forecast_that_is_made_for_other_settings_is_dropped(graph: Any, monkeypatch: pytest.MonkeyPatch):
