@@ -28,7 +28,7 @@ def test_help_names_every_command_and_the_exit_codes():
 
 
 def test_help_waits_for_no_package_of_a_command():
-    slow = "numpy", "numba", "cv2", "scipy", "matplotlib", "rclpy"
+    slow = "numpy", "numba", "cv2", "scipy", "osqp", "matplotlib", "rclpy"
     look = f"import sys; from magnetosuture_thread import cli; print([name for name in {slow} if name in sys.modules])"
     shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=300, check=True)
     assert shown.stdout == "[]\n"

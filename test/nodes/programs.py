@@ -97,7 +97,7 @@ class Programs:
         log = log or self._folder / f"{next(self._numbers)}.log"
         log.write_bytes(b"")
         argv = [name, "--ros-args", *arguments]
-        process = FORKS.Process(target=run, args=(argv, dict(environment), str(log)), daemon=True)
+        process = FORKS.Process(target=run, args=(argv, dict(environment), str(log)))
         process.start()
         started = Program(process, log)
         self._programs.append(started)

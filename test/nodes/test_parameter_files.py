@@ -11,6 +11,7 @@ from rclpy.context import Context
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes.parameters import init, settings_of
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
+from magnetosuture_thread.nodes.perception import perception
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.settings.errors import ConfigurationError
 
@@ -111,3 +112,14 @@ def test_a_node_knows_the_settings_of_another_by_the_same_files(tmp_path: Path, 
             if node is not None:
                 node.destroy_node()
             context.try_shutdown()
+
+
+def test_a_model_in_one_process_with_the_tracker_hears_the_topic_that_it_is_remapped_to(domain: int):
+    context, remap = Context(), "thread_model:needle/measured_cp:=other/measured_cp"
+    init(["program"], context)
+    nodes = perception(context=context, cli_args=["--ros-args", "-r", remap, "-p", "scene:=dish_35mm"])
+    heard = {entry.topic_name for entry in nodes[1].subscriptions}
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+    assert {"/other/measured_cp", "/thread/observation"} <= heard
