@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -19,7 +20,10 @@ from magnetosuture_thread.nodes import program
 from magnetosuture_thread.nodes.processes import NodeProcesses
 
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload([f"magnetosuture_thread.nodes.{name}" for name in (*program.MAKERS, "console")])
+# pytest, as each process imports the main module of its parent.
+FORKS.set_forkserver_preload(
+    ["pytest", *(f"magnetosuture_thread.nodes.{name}" for name in (*program.MAKERS, "console"))]
+)
 TIMEOUT = 90.0  # s for a process on a busy machine
 
 
@@ -97,7 +101,9 @@ class Programs:
         log = log or self._folder / f"{next(self._numbers)}.log"
         log.write_bytes(b"")
         argv = [name, "--ros-args", *arguments]
-        process = FORKS.Process(target=run, args=(argv, dict(environment), str(log)))
+        # By the path of this file: in a new process, the package `test` is that of Python.
+        given = {"init_globals": {"GIVEN": (argv, dict(environment), str(log))}, "run_name": "__main__"}
+        process = FORKS.Process(target=runpy.run_path, args=(__file__,), kwargs=given)
         process.start()
         started = Program(process, log)
         self._programs.append(started)
@@ -142,3 +148,7 @@ def run(argv: list[str], environment: dict[str, str], log: str) -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+if __name__ == "__main__":
+    run(*globals()["GIVEN"])
