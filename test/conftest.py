@@ -16,7 +16,6 @@ import pytest
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.rig.setups import read_setup
 
@@ -30,7 +29,6 @@ atexit.register(shutil.rmtree, STATE, ignore_errors=True)
 os.environ["XDG_STATE_HOME"] = str(STATE)
 
 VIEW = DishView((322.0, 238.0), 8e-5)
-POST = Disc((0.006, -0.004), 0.0015)
 
 
 def arc(tail: np.ndarray, angle: float, curvature: float, length: float = 0.019, points: int = 101) -> np.ndarray:
@@ -59,12 +57,6 @@ def view() -> DishView:
 def camera() -> DishCamera:
     """A camera over an empty dish."""
     return DishCamera(CameraScene(), VIEW, seed=5)
-
-
-@pytest.fixture(scope="session")
-def camera_with_post() -> DishCamera:
-    """A camera over a dish with a post."""
-    return DishCamera(CameraScene(obstacles=[POST]), VIEW, seed=6)
 
 
 @pytest.fixture

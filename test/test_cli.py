@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.cli import COMMANDS, make_parser
+from magnetosuture_thread.cli import COMMANDS
 from magnetosuture_thread.thread.predictor import FORMULATIONS
 from magnetosuture_thread.thread.solvers import SOLVERS
 
@@ -26,14 +25,10 @@ def test_help_names_every_command_and_the_exit_codes():
     assert shown.returncode == 0
     for words in (*COMMANDS, "no medical device", "0 done, 1 the job failed, 2 wrong use"):
         assert words in shown.stdout
-    subparsers = next(action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
-    for name, summary in COMMANDS.items():
-        first_line = (subparsers.choices[name].description or "").partition("\n")[0]
-        assert first_line == summary[:1].upper() + summary[1:] + "."
 
 
 def test_help_waits_for_no_package_of_a_command():
-    slow = "numpy", "numba", "cv2", "scipy", "matplotlib", "rclpy"
+    slow = "numpy", "numba", "cv2", "scipy", "osqp", "matplotlib", "rclpy"
     look = f"import sys; from magnetosuture_thread import cli; print([name for name in {slow} if name in sys.modules])"
     shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=300, check=True)
     assert shown.stdout == "[]\n"
@@ -59,9 +54,7 @@ def test_wrong_use_is_2(arguments: str, capsys: pytest.CaptureFixture[str]):
     ("arguments", "code", "words"),
     [
         (["replay", "nowhere"], 1, "error: nowhere: does not exist"),
-        (["replay", "x" * 300], 1, "error: " + "x" * 300 + ": cannot be read"),
         (["render", "no.npz", "--setup", "petri_35mm_polyamide"], 1, "error: no.npz: does not exist"),
-        (["render", "no.npz", "--setup", "petri_35cm"], 2, "error: setup: got 'petri_35cm'"),
         (["render", "no.npz", "--setup", "x" * 300], 2, "error: setup: got 'xxx"),
     ],
 )

@@ -9,9 +9,9 @@ from typing import ClassVar
 import pytest
 
 from magnetosuture_thread.settings import shared_parameters as shared
-from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity, read_yaml
+from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.parameter_files import key_matches, load_setup
+from magnetosuture_thread.settings.parameter_files import load_setup
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,12 @@ def test_values_are_kept_in_the_fields_type():
     [
         ({"temperature": 5000.0}, "oven.temperature: got 5000.0, expected a number from 273 to 800 K"),
         ({"temperature": float("nan")}, "oven.temperature: got nan, expected a number from 273 to 800 K"),
-        ({"temperature": True}, "oven.temperature: got True, expected a number from 273 to 800 K"),
         ({"temperature": "400 K"}, "oven.temperature: got '400 K', expected a number from 273 to 800 K"),
-        ({"shelves": 2.5}, "oven.shelves: got 2.5, expected a whole number from 1 to 5"),
         ({"kind": "coal"}, "oven.kind: got 'coal', expected one of gas, wood"),
         ({"lit": 1}, "oven.lit: got 1, expected true or false"),
         ({"corners": [0.0]}, "oven.corners: got [0.0], expected a list of a multiple of 2 numbers from -1 to 1 m"),
         ({"corners": [0.0, 7.0]}, "-1 to 1 m; given in metres?"),
         ({"names": ["a", "c"]}, "oven.names: got ['a', 'c'], expected one of a, b"),
-        ({"corners": "0, 1"}, "oven.corners: got '0, 1', expected a list"),
         ({"temprature": 400.0}, "did you mean temperature?"),
         ({"lit": True, "temperature": 280.0}, "oven.temperature: got 280.0, expected at least 300 K when lit"),
     ],
@@ -85,21 +82,16 @@ class Pot(shared.Viscosity, shared.ThreadLength):
     ("text", "words"),
     [
         ("oven: [", "valid YAML"),
-        ("- oven", "sections by node"),
         ("oven: {temperature: 400.0}", "one key, ros__parameters"),
-        ("oven: {ros__parameters: 3}", "parameters by name"),
         (
             "ofen: {ros__parameters: {}}",
             "/ofen: got 'ofen', expected one of /**, oven, kettle, pot (did you mean",
         ),
         ("oven: {ros__parameters: {temperature: 4.0}}", "oven.temperature: got 4.0"),
-        ("oven: {ros__parameters: {1: 4.0}}", "oven.1: got 4.0"),
-        ("oven: {ros__parameters: {temperature: 2026-13-45}}", "oven.temperature: got '2026-13-45'"),
         ("oven: {ros__parameters: {temperature: 1" + 400 * "0" + "}}", "expected a number from 273 to 800 K"),
         ("oven: {ros__parameters: {shelves: 1, shelves: 2}}", "shelves is given twice"),
         ("oven: {ros__parameters: {corners: [0.0, 1]}}", "entries of one kind"),
         ("/**: {ros__parameters: {volume: 0.002}}", "/**.volume: got 0.002, expected a shared parameter"),
-        ("/**: {ros__parameters: {viscositee: 2.0}}", "did you mean viscosity?"),
         ("/**: {ros__parameters: {viscosity: 2e6}}", "kettle.viscosity: got 2000000.0"),
         ("/**/kettle: {ros__parameters: {thread_length: 0.02}}", "kettle.thread_length: got 0.02, expected one of"),
         ("/lab1/*: {ros__parameters: {viscosity: 2.0}}", "/lab1/*: got"),
@@ -107,7 +99,6 @@ class Pot(shared.Viscosity, shared.ThreadLength):
             "/lab1/kettle: {ros__parameters: {volume: 0.002}}\n/lab2/kettle: {ros__parameters: {volume: 0.001}}",
             "/lab2/kettle: got '/lab2', expected one namespace in a setup, as /lab1 before",
         ),
-        ("/**/kettle: {ros__parameters: {volume: 0.002}, other: {}}", "one key, ros__parameters"),
         ("[" * 20_000, "lists and mappings 21 deep in line 1"),
         ("a: &a [1, 2]\nb: *a\n", "an anchor or alias"),
     ],
@@ -153,33 +144,3 @@ def test_sections_are_for_whom_ros_has_them(tmp_path: Path, text: str, kettle: f
     path.write_text(text)
     loaded = load_setup(path, [Kettle, Pot])
     assert (loaded["kettle"].viscosity, loaded["pot"].viscosity) == (kettle, pot)
-
-
-@pytest.mark.parametrize(
-    ("key", "node", "is_for"),
-    [
-        ("/**", "/kettle", True),
-        ("/**/kettle", "/a/b/kettle", True),
-        ("/**/kettle", "/a/kettle_2", False),
-        ("/kettle", "/a/kettle", False),
-        ("/*/kettle", "/a/kettle", True),
-        ("/a/*", "/a/b/kettle", False),
-        ("/a.c/kettle", "/abc/kettle", False),
-    ],
-)
-def test_keys_match_as_in_ros(key: str, node: str, is_for: bool):
-    assert key_matches(key, node) == is_for
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[" * 20_000, "lists and mappings 21 deep in line 1"),
-        ("a: &a [1, 2]\nb: *a\n", "an anchor or alias"),
-        ("# " + "x" * 4_000_000, "a larger file"),
-    ],
-)
-def test_a_setup_past_its_budget_is_refused(tmp_path: Path, text: str, words: str):
-    (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(ConfigurationError, match=words):
-        read_yaml(tmp_path / "a.yaml", "setup file")

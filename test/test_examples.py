@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from test.examples import FOLDER
 
 LINES = 40  # of an example at most
-LINES_OF_A_BARRIER = 25  # that a user writes
 SAYS = {
     "another_solver": "osqp and banded differ by 0.00 nm",
     # The bag's thread has 1.306e-09.
@@ -36,10 +34,3 @@ def test_an_example_runs(name: str):
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert re.search(SAYS[name], done.stdout)
-
-
-@pytest.mark.parametrize("path", sorted((FOLDER / "barriers").glob("*.py")), ids=lambda path: path.stem)
-def test_a_barrier_of_ones_own_is_short(path: Path):
-    lines = path.read_text().splitlines()
-    begin = next(i for i, line in enumerate(lines) if line.startswith("class "))
-    assert len(lines) - begin <= LINES_OF_A_BARRIER

@@ -13,13 +13,10 @@ from rosbags.rosbag2 import StoragePlugin
 
 from magnetosuture_thread import ConfigurationError, cli
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.commands.command import make_console, make_table
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import (
-    BudgetError,
-    check_yaml,
     input_problem,
     output_problem,
     read_regular,
@@ -27,8 +24,6 @@ from magnetosuture_thread.settings.files import (
     whole_folder,
 )
 from test.bags.bags import STRING, read, texts, write_mcap, write_rosbag
-
-NASTY = "a\x1b[31m\u202eb\x9b1m"
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
@@ -42,33 +37,7 @@ def test_what_is_no_regular_file_is_not_even_opened(tmp_path: Path, kind: str, m
         read_regular(path)
 
 
-def test_a_regular_file_is_read_up_to_its_bound(tmp_path: Path):
-    path = tmp_path / "file"
-    path.write_bytes(bytes(100))
-    assert read_regular(path, 100) == bytes(100)
-    with pytest.raises(OSError, match="a larger file"):
-        read_regular(path, 99)
-
-
 BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (BOMB, r"an anchor or alias \(& or \*\) in line 1"),
-        ("\n" + "[" * 100_000, "lists and mappings 21 deep in line 2"),
-        ("[" + "1," * 300_000 + "]", "more than 500000 values"),
-        ("a: !!python/object:os.system ls", r"a tag \(!\)"),
-        ("a: 0o17\nb: 017", "017, which is no decimal number in line 2"),
-    ],
-)
-def test_a_yaml_text_that_grows_or_nests_is_refused_before_it_is_read(text: str, words: str):
-    if "values" in words:
-        text = text.replace("1,", "1,\n")
-        text = f"[{text},{text}]"
-    with pytest.raises(BudgetError, match=words):
-        check_yaml(text, plain=True)
 
 
 def test_what_cannot_be_a_setup_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -76,7 +45,8 @@ def test_what_cannot_be_a_setup_is_one_line(tmp_path: Path, capsys: pytest.Captu
     (tmp_path / "binary.yaml").write_bytes(bytes(range(256)))
     (tmp_path / "huge.yaml").write_text("a: " + "x" * 4_000_000)
     (tmp_path / "bomb.yaml").write_text(BOMB)
-    for name in ("pipe", "binary", "huge", "bomb"):
+    (tmp_path / "deep.yaml").write_text("[" * 100_000)
+    for name in ("pipe", "binary", "huge", "bomb", "deep"):
         assert cli.main(["scene", "check", str(tmp_path / f"{name}.yaml")]) == 2
         errors = capsys.readouterr().err
         assert errors.count("\n") == 1
@@ -181,10 +151,3 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
         with pytest.raises(KeyboardInterrupt), output:
             raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
-
-
-def test_no_name_reaches_the_terminal_raw(capsys: pytest.CaptureFixture[str]):
-    make_console().print(make_table(NASTY, (NASTY,), [(NASTY,)]))
-    shown = capsys.readouterr().out
-    assert not set(shown) & {"\x1b", "\u202e", "\x9b"}
-    assert r"\x1b" in shown

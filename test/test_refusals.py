@@ -205,5 +205,6 @@ def test_whatever_a_public_constructor_is_given_it_says_what_is_wrong(name: str)
         assert not any("\n" in text for text in refused)
 
 
-def test_every_public_constructor_is_tried():
+def test_every_public_constructor_is_tried_and_documented():
+    assert all(getattr(magnetosuture_thread, name).__doc__ for name in magnetosuture_thread.__all__)
     assert set(magnetosuture_thread.__all__) - RECORDS - OTHERS - OF_FILES <= set(MADE)

@@ -78,7 +78,6 @@ def test_in_every_setup_that_ships_the_needle_gets_to_the_end_of_its_path_throug
     ("section", "words"),
     [
         ("/**/coil_bridge: {ros__parameters: {needle_length: 0.008}}", "as vision_tracker.needle_length"),
-        ("/**/thread_model: {ros__parameters: {thread_length: 0.03}}", "as vision_tracker.thread_length"),
         ("/**/coil_bridge: {ros__parameters: {scene: dish_35mm}}", "'', as vision_tracker.scene"),
     ],
 )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from magnetosuture_msgs.msg import BarrierMargin
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.settings.interface import DISH_FRAME
 
 ROOT = Path(__file__).parent.parent
 VIEWERS = ROOT / "config" / "viewers"
@@ -43,21 +41,6 @@ def test_rviz_shows_what_is_there(display: dict[str, Any]):
         assert topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def test_both_look_at_the_dish():
-    assert RVIZ["Global Options"]["Fixed Frame"] == DISH_FRAME
-    assert RVIZ["Views"]["Current"]["Target Frame"] == RVIZ["Displays"][0]["Reference Frame"] == "<Fixed Frame>"
-    assert FOXGLOVE["configById"]["3D!dish"]["followTf"] == DISH_FRAME
-
-
-def panels(layout: Any) -> set[str]:
-    """Return the panels of a layout."""
-    return {layout} if isinstance(layout, str) else panels(layout["first"]) | panels(layout["second"])
-
-
-def test_every_panel_of_foxglove_has_its_settings():
-    assert panels(FOXGLOVE["layout"]) == set(FOXGLOVE["configById"])
-
-
 def fields_of(message: Any, path: str) -> bool:
     """Return whether a message has a field, such as `asked.x` or `least[:]{kind==0}.clearance`."""
     for part in re.sub(r"\[:\]|\{.*?\}", "", path).split("."):
@@ -67,17 +50,6 @@ def fields_of(message: Any, path: str) -> bool:
         if isinstance(message, list):  # of another type of ours
             message = BarrierMargin()
     return True
-
-
-def test_the_documented_line_writes_foxgloves_layout_for_a_rig_with_a_namespace_and_prefix():
-    page = (ROOT / "docs" / "how_to" / "several_rigs.md").read_text()
-    (line,) = re.findall(r"^    (sed .+) > left\.json$", page, re.MULTILINE)
-    done = subprocess.run(line, shell=True, cwd=VIEWERS, capture_output=True, text=True, check=True)
-    layout = json.loads(done.stdout)
-    assert layout["configById"]["3D!dish"]["followTf"] == "left/dish"
-    assert layout["configById"]["DiagnosticSummary!nodes"] == FOXGLOVE["configById"]["DiagnosticSummary!nodes"]
-    given, written = (re.findall(r'"(/[^" ]+)', json.dumps(each)) for each in (FOXGLOVE, layout))
-    assert written == [name if name == "/diagnostics" else f"/left{name}" for name in given]
 
 
 def test_foxglove_shows_what_is_there():

@@ -50,5 +50,3 @@ def forked_nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(NodeProcesses, "start", start_forked(programs))
         yield
-    if programs.cache_info().currsize:
-        programs().close()

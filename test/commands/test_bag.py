@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ from rosbags.rosbag2 import Reader
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from test.bags.bags import HEADER, STRING, cdr, make, read, stamped, write_many_chunks, write_mcap
+from test.bags.bags import HEADER, STRING, cdr, read, stamped, write_many_chunks, write_mcap
 
 
 @pytest.fixture
@@ -37,19 +36,12 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     found = tmp_path / "found.json"
     assert cli.main(["bag", "check", str(tmp_path / "whole"), "--json", str(found)]) == 0
     shown = capsys.readouterr().out
-    for words in (
-        "6 messages in 2.500 s",
-        "std_msgs/Header",
-        "/ground_truth/needle *",
-        "setup: example",
-        "nothing is damaged",
-    ):
-        assert words in shown
+    assert "nothing is damaged" in shown
     assert "/stamped: 2 stamps are before the one before them" in shown
     topics = {topic["topic"]: topic for topic in json.loads(found.read_text())["topics"]}
     told = topics["/stamped"]
     assert (told["messages"], told["rate_hz"], told["first_s"], told["last_s"]) == (6, 2.0, 0.0, 2.5)
-    assert (told["greatest_gap_s"], told["stamps_going_back"], told["frames"]) == (0.5, 2, ["dish"])
+    assert (told["greatest_gap_s"], told["stamps_going_back"]) == (0.5, 2)
     assert (topics["/ground_truth/needle"]["rate_hz"], topics["/ground_truth/needle"]["known"]) == (None, True)
 
 
@@ -80,12 +72,9 @@ def test_repair_makes_a_whole_bag_of_what_is_intact(damaged: Path, tmp_path: Pat
     before = {path: path.read_bytes() for path in damaged.iterdir()}
     output = tmp_path / "repaired"
     assert cli.main(["bag", "repair", str(damaged), "--output", str(output)]) == 0
-    shown = capsys.readouterr().out
     old, new = Bag(damaged), Bag(output)
     assert (old.damage is None, new.damage) == (False, None)
     assert read(new) == read(old)
-    assert f"{sum(new.counts.values())} messages in {output}" in shown
-    assert re.search(r"; messages between \d+\.\d+ s and \d+\.\d+ s", shown)
     assert {path: path.read_bytes() for path in damaged.iterdir()} == before
     with Reader(output) as reader:
         assert reader.message_count == sum(new.counts.values())
@@ -123,22 +112,9 @@ def test_a_recording_stays_when_the_disk_is_full_and_nothing_else_does(tmp_path:
     if kind == "result":
         assert list(tmp_path.iterdir()) == []
         return
-    assert said.startswith(f"{output}: the disk takes no larger file after")
     assert str(output / "bag" / "run_0.mcap") in said
     assert Bag(output / "bag").counts["/noise"] > 60
     assert list(tmp_path.iterdir()) == [output]
-
-
-def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/ground_truth/needle", "geometry_msgs/msg/PoseStamped")
-        point = make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0)
-        turn = make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        pose = make("geometry_msgs/msg/Pose", point, turn)
-        bag.write_message("/ground_truth/needle", 1, make("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose))
-    for words, is_told in (([], True), (["--frame", "world"], False)):
-        assert cli.main(["bag", "check", str(tmp_path / "bag"), *words]) == 0
-        assert ("is not connected to dish" in capsys.readouterr().out) == is_told
 
 
 def test_a_topic_of_ours_in_another_serialization_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

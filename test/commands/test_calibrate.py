@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.calibration.bags import calibrate_bags, thread_settings
+from magnetosuture_thread.calibration.bags import calibrate_bags
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
@@ -91,9 +91,6 @@ def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Pat
     settings = read_setup(str(tmp_path / "1.yaml")).model
     assert stiffness_over_drag(settings) == pytest.approx(TRUE, rel=0.05)
     assert settings.attachment == "pinned"
-    assert {path.name for path in tmp_path.iterdir()} == {
-        f"{n}.{end}" for n in (1, 2) for end in ("yaml", "json", "png")
-    }
 
 
 def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
@@ -118,15 +115,8 @@ def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["nowhere"], 1, "nowhere: does not exist"),
         (["one", "--parameters", "elastic_module"], 2, "did you mean elastic_modulus"),
-        (
-            ["one", "--material", "steel"],
-            2,
-            "material: got 'steel', expected one of polyamide_7_0, silk_6_0, or how",
-        ),
         (["one", "--against", "truth", "--remap", "/ground_truth/thread:=/elsewhere"], 1, "holds no ground truth"),
-        (["one", "--source", "camera"], 1, "camera/image_raw"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(
@@ -150,11 +140,3 @@ def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
         InvalidInputError, match="silk: got a thread with material silk_6_0, expected polyamide_7_0, as"
     ):
         calibrate_bags([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", setup_name=own)
-
-
-def test_another_material_comes_with_its_own_numbers():
-    setup = read_setup("petri_35mm_polyamide")
-    own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
-    assert thread_settings(own, "polyamide") == thread_settings(own) == own.model
-    silk = thread_settings(own, "silk", "paper")
-    assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

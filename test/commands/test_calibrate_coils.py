@@ -32,11 +32,9 @@ def test_a_calibration_is_written_that_the_bridge_takes(tmp_path: Path, capsys: 
     output = tmp_path / "rig_7.yaml"
     assert cli.main(["calibrate-coils", str(probe(tmp_path)), "--output", str(output)]) == 0
     shown = capsys.readouterr().out
-    for words in ("coils as loops", "coil_3", "100 readings, residual", "is in line"):
-        assert words in shown
+    assert "100 readings, residual" in shown
     written = read_calibration(output)
-    assert (written.name, len(written.date)) == ("rig_7", 10)
-    assert "100 readings in probe.csv" in written.notes
+    assert written.name == "rig_7"
     settings = CoilBridgeSettings(calibration=str(output))
     for coil, angle in zip(settings.coils_properties(), ANGLES, strict=True):
         assert np.cos(coil.angle - angle) == pytest.approx(1.0, abs=1e-3)

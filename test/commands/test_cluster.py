@@ -37,7 +37,7 @@ def work(task, log, progress):
         os._exit(9)
     return str(task), os.getpid()
 """
-ENDED_WORKERS = 5  # one by the task that ends its first worker, two by each of two tries of a fatal one
+ENDED_WORKERS = 3  # one by the task that ends its first worker, and one by each of two tries of a fatal one
 
 
 @contextmanager
@@ -48,8 +48,8 @@ def cluster_of(workers: int, folder: Path) -> Iterator[str]:
     """
     (folder / "work_of_tests.py").write_text(SOURCE)
     paths = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
-    once = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
-    environment = {**os.environ, **once, "PYTHONPATH": os.pathsep.join(paths)}
+    never = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}  # the runner repeats a task that lost its worker
+    environment = {**os.environ, **never, "PYTHONPATH": os.pathsep.join(paths)}
     with (folder / "dask.log").open("wb") as log, ExitStack() as stack:
         stack.enter_context(pytest.MonkeyPatch.context()).syspath_prepend(str(folder))
 
@@ -80,11 +80,18 @@ def work() -> Work:
     return cast(Work, importlib.import_module("work_of_tests").work)
 
 
-def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(tmp_path: Path):
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a cluster of which two workers are left when the tests have ended the others."""
+    with cluster_of(ENDED_WORKERS + 2, tmp_path_factory.mktemp("cluster")) as address:
+        yield address
+
+
+def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(cluster: str, tmp_path: Path):
     lines: list[str] = []
     shares: list[float] = []
     tasks = [1, 2, tmp_path / "begun", 4]
-    with cluster_of(ENDED_WORKERS + 1, tmp_path) as address, TaskRunner(work(), 1, address) as runner:
+    with TaskRunner(work(), 1, cluster) as runner:
         results = dict(runner.run(tasks, lines.append, shares.append))
         assert [results[index][0] for index in range(4)] == [str(task) for task in tasks]
         assert os.getpid() not in {process for _, process in results.values()}
@@ -97,17 +104,16 @@ def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated
     assert fatal[1][0] == "5"
 
 
-def test_bags_are_evaluated_alike(short_bag: Path, tmp_path: Path):
+def test_bags_are_evaluated_alike(cluster: str, short_bag: Path, tmp_path: Path):
     bags = [short_bag, tmp_path / "broken.mcap"]
     bags[1].write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-    with cluster_of(2, tmp_path) as address:
-        here, there = (
-            evaluate_bags(bags, tmp_path / f"out{name[:3]}", duration=0.4, scheduler=name) for name in ("", address)
-        )
-        assert [{**row, **dict.fromkeys(TIMES)} for row in here] == [{**row, **dict.fromkeys(TIMES)} for row in there]
-        assert [bool(row["problem"]) for row in there] == [False, True]
-        names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("out", "outtcp")]
-        assert names[0] == names[1]
+    here, there = (
+        evaluate_bags(bags, tmp_path / f"out{name[:3]}", duration=0.4, scheduler=name) for name in ("", cluster)
+    )
+    assert [{**row, **dict.fromkeys(TIMES)} for row in here] == [{**row, **dict.fromkeys(TIMES)} for row in there]
+    assert [bool(row["problem"]) for row in there] == [False, True]
+    names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("out", "outtcp")]
+    assert names[0] == names[1]
 
 
 def test_a_worker_that_has_other_software_later_is_refused_too(tmp_path: Path):

@@ -15,7 +15,6 @@ from magnetosuture_msgs.msg import CoilCurrents
 
 from benchmarks.page import running_console
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, Participant
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
@@ -118,7 +117,6 @@ def test_a_person_steers_the_simulated_rig(tmp_path: Path):
             asyncio.run(use(url, currents))
         assert console.end() == 0
         assert console.output.read_text().endswith("ended\n")
-        assert console.output.read_text().endswith("ended\n")
     first, second = map(Bag, sorted(recordings.iterdir()))  # ended by the choice of a setup, and by Ctrl-C
     assert first.damage is second.damage is None
     assert second.notes["setup"] == OTHER
@@ -179,16 +177,3 @@ def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
     states = [record.decode() for record in Bag(next((tmp_path / "recordings").iterdir())).records({"/coils/state"})]
     assert any(state.armed for state in states)
     assert states[-1].emergency_stopped
-
-
-def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path):
-    for arguments, code, words in (
-        (["petri_36mm"], 2, "setup: got 'petri_36mm'"),
-        (["--port", "70000"], 2, "console.port: got 70000"),
-        (["--address", "0.0.0.0"], 2, "a token, as 0.0.0.0 can be reached"),
-        (["--replay", str(tmp_path / "nowhere")], 1, "does not exist"),
-    ):
-        assert main(["console", *arguments]) == code
-        errors = capsys.readouterr().err
-        assert words in errors
-        assert errors.count("\n") == 1

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.vision.frames import distorted, lens_with
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import packed_compressed_image
@@ -33,7 +31,6 @@ from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.vision.images import decode_image
 from test.bags.bags import changed, make, stamped
 from test.vision.scenes import rod
 
@@ -51,13 +48,11 @@ def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceT
     return path
 
 
-def observed(
-    bag: Path, start: float = 0.0, duration: float = 100.0, progress: Callable[[float], None] = lambda share: None
-) -> ObservationReader:
+def observed(bag: Path, start: float = 0.0) -> ObservationReader:
     """Return what is observed in a bag."""
     recording = Recording(Bag(bag))
-    left = min(duration, recording.duration - start)
-    return BagInput(recording, SETUP, chosen_source(recording, "auto"), start, left).observations(progress)
+    source = chosen_source(recording, "auto")
+    return BagInput(recording, SETUP, source, start, recording.duration - start).observations(lambda share: None)
 
 
 def without(bag: Path, folder: Path, *topics: str) -> Path:
@@ -100,47 +95,6 @@ def with_changes(bag: Path, folder: Path, *changes: tuple[float, Scene, str], ma
     return folder
 
 
-def test_observations_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: ReferenceTrajectory):
-    shares: list[float] = []
-    found = observed(pose_bag, progress=shares.append)
-    seen = list(found)
-    assert (found.source, found.count, found.found, found.refused) == ("poses", 30, 30, {})
-    assert [each.stamp for each in seen] == [round((1.0 + k / 30.0) * 1e9) for k in range(30)]
-    for k, observation in enumerate(seen):
-        tail, _, thread = straight_pull.at(k / 30.0)
-        assert np.linalg.norm(observation.tail - tail) < 6e-5
-        assert np.linalg.norm(observation.heading) == pytest.approx(1.0, abs=1e-12)
-        assert observation.measured.shape == (64, 2)
-        assert np.array_equal(observation.measured[0], observation.tail)
-        assert np.abs(observation.measured[-1] - thread[-1]).max() < 6e-5
-        assert observation.ground_truth.shape == (51, 2)
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
-
-
-def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_path: Path):
-    lens, bend = lens_with(-0.05, (640, 480)), distorted(-0.05)
-    view = SETUP.rig.camera(SETUP.scene).view
-
-    def through_lens(told: bool, old: RecordedMessage, message: Any) -> Any:
-        if old.topic == interface.CAMERA_INFO.recorded:
-            message.k, message.d = np.array(lens.matrix), np.array(lens.coefficients) if told else np.zeros(5)
-        elif old.topic == FRAME:
-            message.data = cv2.imencode(".png", bend(decode_image(message.data), view))[1].ravel()
-        return message
-
-    def tails(bag: Path) -> dict[int, np.ndarray]:
-        return {each.stamp: each.tail for each in observed(bag, duration=0.3) if not each.reason}
-
-    plain, errors = tails(short_bag), []
-    for told in (True, False):
-        found = tails(changed(short_bag, tmp_path / f"{told}", partial(through_lens, told)))
-        assert len(found) >= len(plain) - 1  # The first frame comes before its camera_info.
-        errors.append(max(float(np.linalg.norm(tail - plain[stamp])) for stamp, tail in found.items()))
-    assert errors[0] < 5e-5
-    assert errors[1] > 2.0 * errors[0]
-
-
 def test_what_cannot_be_replayed_is_refused_and_nothing_is_left(pose_bag: Path, tmp_path: Path):
     (tmp_path / "empty.mcap").write_bytes(b"")
     blind = without(pose_bag, tmp_path / "blind", POSE, MEASURED, interface.NEEDLE_COMMAND.recorded)
@@ -148,7 +102,6 @@ def test_what_cannot_be_replayed_is_refused_and_nothing_is_left(pose_bag: Path, 
     for bag, selection, words in (
         (pose_bag, {"source": "camera"}, "camera/image_raw/compressed"),
         (blind, {}, "has no messages on"),
-        (blind, {"source": "poses"}, "has no messages on"),
         (tmp_path / "empty.mcap", {}, r"empty\.mcap"),
         (pose_bag, {"start": 7.0}, "asked to start at 7 s"),
         (unseen, {}, "30 of 30 poses had a needle; waiting for the thread to be seen"),
@@ -249,15 +202,6 @@ def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_pat
     assert 0 < summary.predicted < 28
     assert summary.damage == str(Bag(tmp_path / "cut.mcap").damage)
     assert any(summary.damage in line for line in said)
-
-
-def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
-    wider = replace(SETUP.scene, dish=replace(SETUP.scene.dish, diameter=0.07))
-    bag = with_changes(short_bag, tmp_path / "wider", (1.39, wider, ""))
-    for start, found in ((0.0, 12), (0.5, 0)):
-        # In a dish of twice the diameter, what was the needle is twice as long.
-        tracked = [observation.found for observation in observed(bag, start=start)]
-        assert sum(tracked) == sum(tracked[:found]) >= found - 2
 
 
 def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_path: Path):

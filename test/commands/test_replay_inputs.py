@@ -56,7 +56,7 @@ def given(path: Path, setup_name: str = "", start: float = 0.0) -> AbstractConte
     return open_bag(path, print, setup_name=setup_name, start=start)
 
 
-def test_the_bags_own_scene_counts_whatever_the_setup_says(copied: Copy):
+def test_the_bags_own_scene_counts_before_that_of_any_setup(copied: Copy):
     path = copied((0.0, POST), setup=OWN)
     for name, expected in (("", OWN), ("petri_150mm_silk", "petri_150mm_silk")):
         with given(path, setup_name=name) as found:
@@ -66,13 +66,6 @@ def test_the_bags_own_scene_counts_whatever_the_setup_says(copied: Copy):
 def test_a_bag_without_a_scene_has_that_of_its_setup(copied: Copy):
     with given(copied(setup="petri_35mm_polyamide_post")) as found:
         assert found.setup.scene == read_scene("dish_35mm_post")
-
-
-def test_the_scene_is_the_one_that_was_in_force_at_the_start(copied: Copy):
-    path = copied((0.0, Scene()), (0.4, POST), setup=OWN)
-    for start, scene in ((0.0, Scene()), (0.3, Scene()), (0.6, POST)):
-        with given(path, start=start) as found:
-            assert found.setup.scene == scene
 
 
 def test_a_damaged_scene_is_refused(copied: Copy):

@@ -51,12 +51,6 @@ def test_a_pulled_thread_follows_exactly(tmp_path: Path):
     assert told[-1] < 1.0
 
 
-def test_the_error_is_the_mean_distance_in_percent_of_the_length(tmp_path: Path):
-    evaluation = score_rig([save(tmp_path / "a.npz", aside=1e-4)], 20)
-    assert evaluation.cases[0].max_error_percent == pytest.approx(0.5, rel=1e-4)
-    assert evaluation.mean_error_percent == pytest.approx(0.5 * 66 / 67, rel=1e-4)
-
-
 @pytest.mark.parametrize(
     "changes",
     [{"boundary": "loose"}, {"material": {}}, {"material": {**MATERIAL, "EA_N": 0.0}}, {"material": None}],

@@ -26,14 +26,11 @@ def test_check_shows_dish_version_shapes_and_warnings(capsys: pytest.CaptureFixt
     file = tmp_path / "a.json"
     assert main(["scene", "check", "hernia_ring", "--json", str(file)]) == 0
     shown, scene, report = capsys.readouterr().out, read_scene("hernia_ring"), json.loads(file.read_text())
-    for words in ("dish of 50 mm, 3 mm deep", scene.version, "ring", "annular_sector", "11.10, 15.88", "93.31"):
-        assert words in shown
+    assert scene.version in shown
     assert report["version"] == scene.version
-    assert report["dish"] == {"diameter": 0.05, "depth": 0.003, "wall_friction": 0.0, "self_contact": None}
     assert [shape["name"] for shape in report["shapes"]] == list(scene.names)
     ring = report["shapes"][0]
     assert ring["definition"]["annulus"]["outer_radius"] == 0.006
-    assert (ring["type"], ring["kind"], ring["vertices"]) == ("annulus", "tissue", 232)
     assert ring["bounds_m"] == pytest.approx([-0.006, -0.001, 0.006, 0.011])
     assert ring["area_m2"] == pytest.approx(np.pi * (0.006**2 - 0.0045**2), rel=2e-3)
     assert report["warnings"] == []
@@ -74,7 +71,6 @@ def test_names_that_mean_something_to_programs_are_drawn_and_shown_as_they_are(t
     ("arguments", "words"),
     [
         (["check", "nowhere"], "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dead_end"),
-        (["check", "BAD"], "bad.yaml: post.disc.radius: got 1.5, expected a number from 1e-06 to 1 m"),
         (["draw", "BAD", "--output", "OUT/a.png"], "bad.yaml: post.disc.radius: got 1.5, expected a number"),
         (["draw", "hernia_ring", "--output", "OUT/a.gif"], "a.gif', expected a file that ends in .png or .svg"),
     ],

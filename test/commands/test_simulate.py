@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +20,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands import reproduce
-from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate, too_slow
+from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 from magnetosuture_thread.settings.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, SCENE, TIP_SETPOINT
@@ -63,16 +62,15 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(scenario: Path, tmp_path_factory: pytest.TempPathFactory):
-    """Run it at half the speed, for busy machines; return the bag, the figures and what was logged."""
+    """Run it at half the speed, for busy machines; return the bag, the figures and the progress."""
     bag = tmp_path_factory.mktemp("run") / "bag"
-    logged: list[str] = []
     shares: list[float] = []
-    summary = simulate(str(scenario), bag, rate=0.5, log=logged.append, progress=shares.append)
-    return bag, summary, logged, shares
+    summary = simulate(str(scenario), bag, rate=0.5, progress=shares.append)
+    return bag, summary, shares
 
 
 def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
-    _, summary, logged, shares = run
+    _, summary, shares = run
     assert summary.setup == "short"
     assert summary.frames >= 20
     assert summary.tracked >= 0.9 * summary.frames
@@ -82,7 +80,6 @@ def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     assert summary.path_error < 2e-3  # how well is for a quiet machine to say
     assert summary.error_truth is not None
     assert summary.error_truth["mean"] < 2.0
-    assert any("this machine only" in line for line in logged)
     assert shares[-1] == 1.0
 
 
@@ -194,17 +191,13 @@ def test_an_interrupted_run_on_a_simulated_clock_keeps_what_was_recorded(scenari
     assert bag.start < 1000e9  # on the simulation's own clock
 
 
-def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(tmp_path: Path):
     (tmp_path / "near.yaml").write_text(NEAR)
     (tmp_path / "open.yaml").write_text(OPEN)
     output = tmp_path / "bag"
     summary_file = tmp_path / "figures.json"
     arguments = ["--procedure", str(tmp_path / "near.yaml"), "--rate", "0.5", "--json", str(summary_file)]
     assert main(["simulate", str(tmp_path / "open.yaml"), "--output", str(output), *arguments]) == 0
-    printed = capsys.readouterr().out
-    assert re.search(r"procedure near.* succeeded, 1 of 1 goals met", printed)
     assert (output / SUMMARY_FILE).read_text() == summary_file.read_text()
     assert '"state": "done"' in summary_file.read_text()
     assert '"goals_met": 1' in summary_file.read_text()
@@ -213,12 +206,3 @@ def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(
     assert scenes == {read_scene("dish_35mm_post").version}  # the procedure's, in place of the setup's
     for channel, count in ((PROCEDURE_STATE, 5), (PROCEDURE_PLAN, 0), (NEEDLE_COMMAND, 10), (TIP_SETPOINT, 10)):
         assert bag.counts[channel.recorded] > count
-
-
-@pytest.mark.parametrize(
-    ("skipped", "rate", "words"),
-    [(73, 1.0, "try --rate 0.5"), (73, 3.0, "try --rate 1.5"), (73, 0.5, "end other programs"), (4, 1.0, "")],
-)
-def test_a_machine_that_is_too_slow_is_named(skipped: int, rate: float, words: str):
-    expected = f"{skipped} of 109 frames skipped; {words}" if words else ""
-    assert too_slow(skipped, 109 - skipped, rate) == expected

@@ -46,22 +46,3 @@ def test_a_held_jog_is_repeated_at_the_rate_until_nobody_holds_it(monkeypatch: p
         loop.run_next()
     assert [at for at, _ in sent] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.35])
     assert [velocity for _, velocity in sent] == [(0.001, 0.0)] * 4 + [(0.0, 0.0)]
-
-
-def test_the_rate_is_kept_where_each_command_is_late_and_is_not_made_up_for_after_a_pause(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    loop = ManualLoop()
-    monkeypatch.setattr(asyncio, "get_running_loop", lambda: loop)
-    sent: list[float] = []
-    controller = JogController(lambda velocity: sent.append(loop.now), rate=10.0, timeout=5.0)
-    controller.acquire_control(1)
-    controller.jog(1, (0.001, 0.0))
-    for _ in range(4):
-        loop.now = loop.scheduled[0][0] + 0.03
-        loop.run_next()
-    assert sent == pytest.approx([0.0, 0.13, 0.23, 0.33, 0.43])
-    loop.now = 1.0
-    while loop.now < 1.25:
-        loop.run_next()
-    assert sent.count(1.0) <= 2

@@ -6,10 +6,11 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, Position, ViewportSize, expect
+from playwright.sync_api import Browser, Page, ViewportSize, expect
 
 from test.console.conftest import ServedConsole
 from test.console.scene import TAIL, estimated_state, forecast_state, picture, state
@@ -17,8 +18,15 @@ from test.console.scene import TAIL, estimated_state, forecast_state, picture, s
 pytestmark = pytest.mark.slow
 
 WAIT_TIMEOUT = 15.0  # [s]
-REST = (0.0, 0.0)
-LAPTOP: ViewportSize = {"width": 1366, "height": 768}
+REST, EAST = (0.0, 0.0), (0.003, 0.0)
+TIP = (TAIL[0] + 0.007, TAIL[1])  # m
+LAPTOP, PHONE = ViewportSize(width=1366, height=768), ViewportSize(width=390, height=844)
+ON_TOP = """(id) => {
+    const element = document.getElementById(id), box = element.getBoundingClientRect();
+    const found = document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2);
+    return box.top >= 0 && box.bottom <= innerHeight && box.right <= innerWidth && element.contains(found);
+}"""
+RULER_STEP = 20  # [px]
 
 
 def until(page: Page, condition: Callable[[], Any]) -> Any:
@@ -60,6 +68,20 @@ class Operator:
         self.page.click("#control")
         expect(self.page.locator("#holder")).to_have_text("you have control")
 
+    def hold(self) -> None:
+        """Take control and hold a key, and wait until the needle is commanded to the east."""
+        self.take_control()
+        self.page.keyboard.down("ArrowRight")
+        self.last(EAST)
+
+    def tip(self) -> tuple[float, float]:
+        """Return where the needle's tip is on the screen [px]."""
+        dish = self.page.locator("#dish")
+        box, scale = dish.bounding_box(), float(dish.get_attribute("data-scale") or 0)
+        assert box is not None
+        u, v = (float(entry) for entry in (dish.get_attribute("data-centre") or "").split(","))
+        return box["x"] + u + scale * TIP[0], box["y"] + v - scale * TIP[1]
+
     def last(self, velocity: tuple[float, float]) -> None:
         """Wait until this is the last command."""
         self.until(lambda: self.served.graph.last == pytest.approx(velocity, abs=1e-9))
@@ -74,11 +96,6 @@ class Operator:
         """Wait until so many commands more have gone out."""
         before = len(self.served.graph.commands)
         self.until(lambda: len(self.served.graph.commands) > before + count)
-
-    def drawn(self, friction: str) -> str:
-        """Wait until a state of friction is drawn, and return its colour."""
-        expect(self.page.locator("#dish")).to_have_attribute("data-friction", friction)
-        return str(self.page.get_attribute("#dish", "data-colour"))
 
 
 @pytest.fixture
@@ -109,16 +126,12 @@ def test_a_click_tells_which_end_of_the_needle_is_its_tip(operator: Operator):
     dish = operator.page.locator("#dish")
     expect(dish).to_have_attribute("data-axis", "yes")
     expect(operator.page.locator("#headline")).to_have_text("Which end of the needle is the tip?")
-    scale, ratio = float(dish.get_attribute("data-scale") or 0), operator.page.evaluate("devicePixelRatio")
-    u, v = (float(entry) / ratio for entry in (dish.get_attribute("data-centre") or "").split(","))
-    tip = (TAIL[0] + 0.007, TAIL[1])
-    place: Position = {"x": u + tip[0] * scale / ratio, "y": v - tip[1] * scale / ratio}
-    dish.click(position=place)  # without control
+    operator.page.mouse.click(*operator.tip())  # without control
     assert operator.served.graph.tips == []
     operator.take_control()
-    dish.click(position=place)
+    operator.page.mouse.click(*operator.tip())
     operator.until(lambda: operator.served.graph.tips)
-    assert operator.served.graph.tips == [pytest.approx(tip, abs=1e-4)]
+    assert operator.served.graph.tips == [pytest.approx(TIP, abs=1e-4)]
     expect(dish).to_have_attribute("data-axis", "no")
     assert operator.served.graph.commands == []
 
@@ -162,13 +175,8 @@ def test_gamepad_stick_jogs_after_it_was_centred(operator: Operator):
 
 def test_dragging_from_the_needle_jogs(operator: Operator):
     operator.take_control()
-    tip = TAIL[0] + 0.007, TAIL[1]  # m
-    box = operator.page.locator("#dish").bounding_box()
+    (x, y), mouse, box = operator.tip(), operator.page.mouse, operator.page.locator("#dish").bounding_box()
     assert box is not None
-    scale = float(operator.page.get_attribute("#dish", "data-scale") or 0)
-    u, v = (float(entry) for entry in (operator.page.get_attribute("#dish", "data-centre") or "").split(","))
-    x, y = box["x"] + u + scale * tip[0], box["y"] + v - scale * tip[1]
-    mouse = operator.page.mouse
     mouse.move(x + 150, y + 200)
     mouse.down()
     mouse.move(x + 160, y + 200)
@@ -191,23 +199,21 @@ def test_key_held_while_focus_is_lost_must_be_pressed_again(operator: Operator):
     operator.take_control()
     for lost in ("blur", "offline", "pagehide"):
         operator.page.keyboard.down("ArrowRight")
-        operator.last((0.003, 0.0))
+        operator.last(EAST)
         operator.page.evaluate(f"window.dispatchEvent(new Event('{lost}'))")
         operator.last(REST)
         operator.page.keyboard.down("ArrowRight")  # the browser repeats the key
         operator.nothing_more()
         operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.last(EAST)
     operator.page.context.set_offline(True)
     operator.last(REST)
     operator.page.context.set_offline(False)
 
 
 def test_hidden_tab_stops_the_needle_and_loses_control(operator: Operator):
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.hold()
     hide = "Object.defineProperty(document, '{}', {{value: {}, configurable: true}})"
     operator.page.evaluate(hide.format("hidden", "true"))
     operator.page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
@@ -217,9 +223,7 @@ def test_hidden_tab_stops_the_needle_and_loses_control(operator: Operator):
 
 
 def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.hold()
     operator.page.focus("#control")
     operator.page.keyboard.press("Space")
     operator.until(lambda: operator.served.graph.actions == ["stop"])
@@ -235,13 +239,11 @@ def test_space_stops_everything_wherever_the_focus_is(operator: Operator):
     assert len(operator.served.graph.commands) == count
     operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.last(EAST)
 
 
 def test_lost_connection_stops_the_needle_and_control_is_not_resumed(operator: Operator):
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
+    operator.hold()
     operator.served.tear()
     operator.last(REST)
     expect(operator.page.locator("#link")).to_contain_text("Connected as page 2")
@@ -250,25 +252,7 @@ def test_lost_connection_stops_the_needle_and_control_is_not_resumed(operator: O
     operator.nothing_more()
     operator.page.keyboard.up("ArrowRight")
     operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
-
-
-def test_colours_tell_the_friction(operator: Operator):
-    graph = operator.served.graph
-    operator.page.emulate_media(color_scheme="light")
-    assert operator.drawn("free") == "#12a150"
-    graph.shown = state("sliding", 4)
-    expect(operator.page.locator("#friction")).to_contain_text("sliding: 4 node")
-    expect(operator.page.locator("#friction")).to_contain_text("0.66")
-    assert operator.drawn("sliding") not in ("#12a150", "#2f6bff")
-    graph.shown = state("stuck", 3)
-    assert operator.drawn("stuck") == "#2f6bff"
-    graph.shown["margins"].update(valid=False, reason="no program was solved")
-    assert operator.drawn("invalid") == "#7d8790"
-    expect(operator.page.locator("#margins")).to_contain_text("no program was solved")
-    graph.shown = state("free")
-    graph.shown["predicted"]["age"] = 2.0
-    assert operator.drawn("old") == "#7d8790"
+    operator.last(EAST)
 
 
 def test_without_the_token_every_control_is_off(browser: Browser, served: ServedConsole):
@@ -315,16 +299,10 @@ CAUSES: list[tuple[str, dict[str, Any], str]] = [  # why nothing moves, in the o
     ("host", {"paused": True}, "Paused"),
     ("bridge", {"state": "inactive"}, "Coil bridge is inactive"),
     ("tracker", {"state": "lost", "reason": "no needle"}, "Needle lost: no needle"),
-    ("nodes", {"rig_simulator": {"level": "silent", "message": "", "age": 9.0}}, "Simulator silent for 9"),
     ("needle", {"age": 2.0}, "Camera silent for 3"),  # the camera's age is added below
-    ("bridge", {"driver_ready": False}, "Driver simulated is not ready"),
-    ("view", {"late": 0.3}, "Computer or network late"),
     ("bridge", {"armed": False}, "Disarmed: press Arm"),
     ("filter", {"reason": "stopped by ring"}, "At rest: stopped by ring"),
-    ("bridge", {"reasons": ["no thread prediction yet"]}, "At rest: no thread prediction yet"),
-    ("filter", {"active": ["wall"]}, "At rest: stopped by wall"),
     ("filter", {"slowdown": 0.001}, "At rest: slowed to 0 % by friction"),
-    ("bridge", {"saturated": True}, "At rest: the coils are at their limit"),
 ]
 
 
@@ -340,26 +318,63 @@ def test_a_held_key_without_motion_always_has_a_reason(operator: Operator):
         assert operator.page.evaluate(script, view).startswith(expected)
 
 
-def test_estimate_disturbance_and_forecast_are_shown_while_there_are_any(operator: Operator) -> None:
-    graph, page = operator.served.graph, operator.page
-    dish, margins = page.locator("#dish"), page.locator("#margins")
+def test_estimate_disturbance_forecast_and_friction_are_shown_while_there_are_any(operator: Operator):
+    graph, dish = operator.served.graph, operator.page.locator("#dish")
     graph.shown = estimated_state()
     expect(dish).to_have_attribute("data-estimate", "measured")
     expect(dish).to_have_attribute("data-disturbances", "1")
-    for text in ("Measured50 %", "99 % bound", "Held at 22 mm of the thread: 0.2 mN up and to the left"):
-        expect(margins).to_contain_text(text)
+    expect(operator.page.locator("#margins")).to_contain_text("Held at 22 mm of the thread")
     graph.shown = forecast_state()
     expect(dish).to_have_attribute("data-estimate", "none")
     expect(dish).to_have_attribute("data-disturbances", "0")
     expect(dish).to_have_attribute("data-ghosts", "3")
-    expect(page.locator("#forecast-legend")).to_have_text("forecast for 3.0 s, fainter the later")
-    expect(page.locator("#forecast")).to_be_hidden()  # nothing happens
-    graph.shown = state()
+    graph.shown = state("sliding", 4)
     expect(dish).to_have_attribute("data-ghosts", "0")
-    expect(page.locator("#forecast-legend")).to_be_hidden()
+    expect(dish).to_have_attribute("data-friction", "sliding")
+    graph.shown["margins"].update(valid=False, reason="no program was solved")
+    expect(dish).to_have_attribute("data-friction", "invalid")
+    graph.shown = state()
+    graph.shown["predicted"]["age"] = 2.0
+    expect(dish).to_have_attribute("data-friction", "old")
 
 
 def test_a_shape_with_a_hostile_name_is_shown_as_text(operator: Operator) -> None:
     operator.served.graph.shown = forecast_state("touches the <b>ring</b> in 0.8 s")
     expect(operator.page.locator("#forecast")).to_have_text("Touches the <b>ring</b> in 0.8 s")
     assert operator.page.locator("#forecast b").count() == 0
+
+
+@pytest.mark.parametrize("size", [LAPTOP, PHONE], ids=["laptop", "phone"])
+def test_the_emergency_stop_is_in_sight_wherever_the_page_is_scrolled(operator: Operator, size: ViewportSize):
+    operator.page.set_viewport_size(size)
+    for place in (0, 10_000):
+        operator.page.evaluate("(y) => { scrollTo(0, y); document.querySelector('aside').scrollTo(0, y); }", place)
+        assert operator.page.evaluate(ON_TOP, "stop")
+
+
+def test_a_person_stops_over_tls(browser: Browser, certificate: tuple[Path, Path]):
+    path, key = map(str, certificate)
+    served = ServedConsole(certificate=path, private_key=key)
+    served.url = served.run(served.server.start())
+    context = browser.new_context(ignore_https_errors=True)
+    operator = Operator(context.new_page(), served)
+    operator.page.keyboard.press("Space")
+    operator.until(lambda: served.graph.actions == ["stop"])
+    context.close()
+    served.close()  # which holds that no connection is left open
+
+
+def test_the_ruler_measures_and_jogs_nothing(operator: Operator):
+    operator.take_control()
+    page, dish = operator.page, operator.page.locator("#dish")
+    page.click("#ruler")
+    (x, y), scale = operator.tip(), float(dish.get_attribute("data-scale") or 0)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x - 3.0 * RULER_STEP, y + 4.0 * RULER_STEP)
+    page.mouse.up()
+    length = pytest.approx(1e3 * 5.0 * RULER_STEP / scale, abs=2e3 / scale)  # mm; pointers are rounded to pixels
+    operator.until(lambda: float((dish.get_attribute("data-ruler") or "0").split()[0]) == length)
+    assert operator.served.graph.commands == []
+    page.click("#ruler")
+    expect(dish).to_have_attribute("data-ruler", "")

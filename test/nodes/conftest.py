@@ -58,13 +58,6 @@ class Graph:
         """Return a context in which no callback is at work."""
         return self._spinning
 
-    def remove(self, node: Node) -> None:
-        """Take a node out of the graph and destroy it, once no callback of it is at work."""
-        with self.between_callbacks():
-            self.executor.remove_node(node)
-            self.nodes.remove(node)
-            node.destroy_node()
-
     def listen(self, topic: Topic) -> list[Any]:
         """Return the list that grows with every message on a topic, once somebody publishes it."""
         messages = self.listen_later(topic)
@@ -171,11 +164,9 @@ def graph(shared_context: tuple[Context, int]) -> Iterator[Graph]:
 
 
 @pytest.fixture(scope="session")
-def all_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Programs]:
+def all_programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
     """Start node programs, forked from one process."""
-    made = Programs(tmp_path_factory.mktemp("programs"))
-    yield made
-    made.close()
+    return Programs(tmp_path_factory.mktemp("programs"))
 
 
 @pytest.fixture

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
-import json
+import multiprocessing
 import os
-import select
+import runpy
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NoReturn
 
 from magnetosuture_thread.nodes import program
 from magnetosuture_thread.nodes.processes import NodeProcesses
 
+FORKS = multiprocessing.get_context("forkserver")
+# pytest, as each process imports the main module of its parent.
+FORKS.set_forkserver_preload(
+    ["pytest", *(f"magnetosuture_thread.nodes.{name}" for name in (*program.MAKERS, "console"))]
+)
 TIMEOUT = 90.0  # s for a process on a busy machine
 
 
@@ -26,13 +31,13 @@ class Program:
     """A node that runs as its program.
 
     Args:
-        pid: of the process.
+        process: that runs it.
         log: file that gets what it prints.
-        code: file that gets its exit code.
     """
 
-    def __init__(self, pid: int, log: Path, code: Path) -> None:
-        self.pid, self._log, self._code = pid, log, code
+    def __init__(self, process: ForkServerProcess, log: Path) -> None:
+        self._process, self._log = process, log
+        self.pid = process.pid or 0
 
     @property
     def output(self) -> str:
@@ -51,7 +56,7 @@ class Program:
 
     def poll(self) -> int | None:
         """Return the exit code, None while it runs."""
-        return int(self._code.read_text()) if self._code.exists() else None
+        return self._process.exitcode
 
     @property
     def returncode(self) -> int | None:
@@ -60,11 +65,9 @@ class Program:
 
     def wait(self, timeout: float = TIMEOUT) -> int:
         """Return the exit code once it has ended, or raise `TimeoutExpired` with what it has printed."""
-        deadline = time.monotonic() + timeout
-        while (code := self.poll()) is None:
-            if time.monotonic() > deadline:
-                raise subprocess.TimeoutExpired(self.output, timeout)
-            time.sleep(0.005)
+        self._process.join(timeout)
+        if (code := self.poll()) is None:
+            raise subprocess.TimeoutExpired(self.output, timeout)
         return code
 
     def wait_for(self, words: str, timeout: float = TIMEOUT) -> None:
@@ -92,21 +95,17 @@ class Programs:
     def __init__(self, folder: Path) -> None:
         self._folder, self._numbers = folder, itertools.count()
         self._programs: list[Program] = []
-        command = [sys.executable, __file__]
-        self._server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def start(self, name: str, *arguments: str, environment: Mapping[str, str], log: Path | None = None) -> Program:
         """Start the program of a name with ROS arguments; what it prints goes to a file of ours unless one is given."""
-        assert self._server.stdin is not None
-        assert self._server.stdout is not None
-        number = next(self._numbers)
-        log, code = log or self._folder / f"{number}.log", self._folder / f"{number}.code"
+        log = log or self._folder / f"{next(self._numbers)}.log"
         log.write_bytes(b"")
         argv = [name, "--ros-args", *arguments]
-        given = {"argv": argv, "environment": dict(environment), "log": str(log), "code": str(code)}
-        self._server.stdin.write(json.dumps(given) + "\n")
-        self._server.stdin.flush()
-        started = Program(int(self._server.stdout.readline()), log, code)
+        # By the path of this file: in a new process, the package `test` is that of Python.
+        given = {"init_globals": {"GIVEN": (argv, dict(environment), str(log))}, "run_name": "__main__"}
+        process = FORKS.Process(target=runpy.run_path, args=(__file__,), kwargs=given)
+        process.start()
+        started = Program(process, log)
         self._programs.append(started)
         return started
 
@@ -115,11 +114,6 @@ class Programs:
         for each in self._programs:
             each.kill()
         self._programs.clear()
-
-    def close(self) -> None:
-        """End the process that forks them."""
-        with self._server:  # which closes its pipes
-            pass
 
 
 def start_forked(programs: Callable[[], Programs]) -> Callable[..., None]:
@@ -135,45 +129,16 @@ def start_forked(programs: Callable[[], Programs]) -> Callable[..., None]:
     return fork
 
 
-def serve() -> None:
-    """Fork a program for each line on standard input, and note exit codes."""
-    for name in (*program.MAKERS, "console"):
-        importlib.import_module(f"magnetosuture_thread.nodes.{name}")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a person who ends the tests
-    codes: dict[int, Path] = {}
-    ends = False
-    while codes or not ends:
-        if not ends and select.select([sys.stdin], [], [], 0.0 if codes else 0.2)[0]:
-            line = sys.stdin.readline()
-            ends = not line
-            for pid in codes if ends else ():  # whoever started them is gone
-                os.kill(pid, signal.SIGINT)
-            if line:
-                given = json.loads(line)
-                pid = os.fork()
-                if not pid:
-                    run(given)
-                codes[pid] = Path(given["code"])
-                print(pid, flush=True)
-        for pid in list(codes):
-            done, status = os.waitpid(pid, os.WNOHANG)
-            if done:
-                path = codes.pop(pid)
-                path.with_suffix(".new").write_text(str(os.waitstatus_to_exitcode(status)))
-                path.with_suffix(".new").rename(path)
-        time.sleep(0.005)
-
-
-def run(given: dict[str, Any]) -> NoReturn:
+def run(argv: list[str], environment: dict[str, str], log: str) -> NoReturn:
     """Become a program."""
     os.environ.clear()
-    os.environ.update(given["environment"])
-    log = os.open(given["log"], os.O_WRONLY | os.O_APPEND)
+    os.environ.update(environment)
+    output = os.open(log, os.O_WRONLY | os.O_APPEND)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.argv = given["argv"]
+    sys.argv = argv
     code = 1
     try:
         code = program.main()
@@ -186,4 +151,4 @@ def run(given: dict[str, Any]) -> NoReturn:
 
 
 if __name__ == "__main__":
-    serve()
+    run(*globals()["GIVEN"])

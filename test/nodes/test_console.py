@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -15,7 +13,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
-from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.geometry.scene_files import read_scene
@@ -25,10 +22,7 @@ from magnetosuture_thread.nodes.clients import Participant
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
-from magnetosuture_thread.nodes.processes import graph_environment
 from test.nodes import wire
-
-SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
 
 @pytest.fixture
@@ -95,7 +89,7 @@ def known_part(console: ConsoleGraph, name: str) -> object:
 
 def test_the_axis_of_a_needle_is_told_and_a_point_at_its_tip_is_published(graph, console):
     tips, tail = graph.listen(topics.NEEDLE_TIP), np.array([0.002, -0.001])
-    for deviation, known, unknown in ((10.0, "axis", "needle"), (0.1, "needle", "axis"), (np.inf, "axis", "needle")):
+    for deviation, known, unknown in ((0.1, "needle", "axis"), (np.inf, "axis", "needle")):
         pose = wire.pose_message(graph.now(), tail, np.array([1.0, 0.0]), np.diag([1e-9, 1e-9, deviation**2]))
         tell(graph, topics.NEEDLE_POSE, pose, partial(known_part, console, known), known)
         assert console.state()[known]["tail"] == pytest.approx(tail)
@@ -179,7 +173,6 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
         return (state["procedure"] or {}).get("state") == "ready" and len(state["plan"]) > 10
 
     graph.wait(is_shown, "state and plan")
-    assert console.state()["procedure"]["goals"] == ["go_to"]
     assert asyncio.run(console.execute_procedure("resume", "", False)) == ""
 
     def is_in(state: str, reason: str) -> bool:
@@ -197,25 +190,3 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     assert commands == []
     console.blocked = "starting"
     assert asyncio.run(console.execute_procedure("plan", near, False)) == "starting"
-
-
-def test_the_node_serves_the_page_and_answers_the_services_of_its_parameters(graph, programs):
-    process = programs.start("console", "-p", "port:=0", environment=graph_environment(graph.domain))
-    process.wait_for("/#token=")
-    found = re.search(r"http://127\.0\.0\.1:\d+/", process.output)
-    assert found is not None
-    with urllib.request.urlopen(found[0], timeout=10.0) as page:
-        assert page.status == 200
-    client = AsyncParameterClient(graph.probe, "console")
-    graph.wait(client.services_are_ready, "the parameter services")
-    answers = [client.get_parameters(["port"])]
-
-    def answered() -> bool:
-        if time.monotonic() > asked + len(answers):  # an answer may be lost before the two have found each other
-            answers.append(client.get_parameters(["port"]))
-        return any(answer.done() for answer in answers)
-
-    asked = time.monotonic()
-    graph.wait(answered, "an answer")
-    (values, *_) = (answer.result().values for answer in answers if answer.done())
-    assert [value.integer_value for value in values] == [0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -14,18 +14,12 @@ from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import ProcedureState
 from magnetosuture_msgs.srv import PlanProcedure
-from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
-from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.node import INACTIVE
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
-from magnetosuture_thread.nodes.thread_model import ThreadForecasts, ThreadModelNode
-from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.settings.interface import STANDBY_NODES, Service
 from test.nodes import wire
 from test.nodes.conftest import Graph
@@ -42,13 +36,6 @@ ACTIVE = {  # how the first report of each begins while it is active
     "path_follower": "no needle pose yet",
     "scene_server": "scene ",
 }
-HANDLERS: dict[str, Any] = {  # classes of which methods take messages and timers
-    "vision_tracker": [VisionTrackerNode],
-    "thread_model": [ThreadModelNode, ThreadForecasts],
-    "needle_planner": [NeedlePlannerNode],
-    "path_follower": [PathFollowerNode],
-}
-IN_EVERY_STATE = ("on_scene", "on_material", "on_camera_info", "on_bridge", "on_plan")  # published only when it changes
 BEGIN = int(time.time()) + 3600  # s; late poses are refused, however slowly a test runs
 
 
@@ -94,69 +81,21 @@ def test_it_goes_as_far_as_autostart_says_through_its_states_twice_and_ends(grap
         third.finish()  # as its process does then
 
 
+def test_an_inactive_model_predicts_nothing(graph: Graph):
+    graph.add(ThreadModelNode, autostart="inactive", initial_shape="straight")
+    predicted = graph.listen(topics.PREDICTED_THREAD)
+    for second in (1, 2):
+        pose = wire.pose_message(Time(sec=second), np.zeros(2), np.array([1.0, 0.0]))
+        graph.publish(topics.NEEDLE_POSE, pose)
+        assert second == 2 or graph.change("thread_model", ACTIVATE)
+    graph.wait(lambda: bool(predicted), "a prediction")
+    assert [each.header.stamp.sec for each in predicted] == [2]
+
+
 def entities(node: Any) -> list[str]:
     """Return the names of all that a node has in the graph."""
     topic_names = [each.topic_name for each in (*node.publishers, *node.subscriptions)]
     return sorted([*topic_names, *(each.srv_name for each in node.services), *["timer" for _ in node.timers]])
-
-
-@pytest.mark.parametrize(
-    ("name", "others"), [*((name, {}) for name in HANDLERS), ("vision_tracker", {"image_transport": "raw"})]
-)
-def test_an_inactive_node_handles_no_message_and_no_timer(
-    graph: Graph, name: str, others: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-):
-    make, parameters = NODES[name]
-    handled: list[str] = []
-
-    def noted(handler: str) -> Callable[..., None]:
-        return lambda *_: handled.append(handler)
-
-    for owner in HANDLERS[name]:
-        for handler in [each for each in vars(owner) if each.startswith("on_") and each not in IN_EVERY_STATE]:
-            monkeypatch.setattr(owner, handler, noted(handler))
-    node = graph.add(make, autostart="inactive", **{**parameters, **others})
-    subscriptions = [each for each in node._held if isinstance(each, Subscription)]
-    timers = [each for each in node._held if isinstance(each, Timer)]
-
-    def call() -> list[str]:
-        with graph.between_callbacks():
-            handled.clear()
-            for subscription in subscriptions:
-                subscription.callback(serialize_message(subscription.msg_type()))
-            for timer in timers:
-                timer.callback()
-            return sorted(handled)
-
-    assert call() == []
-    assert graph.change(name, ACTIVATE)
-    latched = {f"/{topics.BRIDGE_STATE.name}", f"/{topics.PROCEDURE_PLAN.name}"}
-    in_every_state = sum(each.topic_name in latched for each in subscriptions)
-    assert len(call()) == len(subscriptions) + len(timers) - in_every_state > 0
-
-
-def broken() -> None:
-    """Fail as nobody expects it."""
-    raise RuntimeError("nobody foresaw this")
-
-
-def test_a_deactivation_that_fails_gives_everything_back(graph: Graph, monkeypatch: pytest.MonkeyPatch):
-    name = "needle_planner"
-    make, parameters = NODES[name]
-    reports = graph.listen_later(topics.DIAGNOSTICS)
-    node = graph.add(make, autostart="unconfigured", **parameters)
-    before = entities(node)
-    assert graph.change(name, CONFIGURE, ACTIVATE)
-    graph.wait(lambda: state_of(reports).startswith(ACTIVE[name]), "the report")
-    monkeypatch.setattr(node, "deactivate", broken)
-    assert not graph.change(name, DEACTIVATE)
-    assert graph.stage(name) == "unconfigured"
-    assert entities(node) == before
-    assert "nobody foresaw this" in str(node.problem)
-    graph.wait(lambda: state_of(reports) == "unconfigured", "the report")
-    monkeypatch.undo()
-    assert node.set_parameters([Parameter("scene", value="dish_50mm")])[0].successful
-    assert graph.change(name, CONFIGURE, ACTIVATE)
 
 
 @pytest.fixture

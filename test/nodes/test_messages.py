@@ -18,32 +18,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.serialization import serialize_message
-from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.bags import markers, packing, reading
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.scene_message import packed_scene
-from magnetosuture_thread.coils import bridge
-from magnetosuture_thread.coils import filter as safety
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
-from magnetosuture_thread.forecast import rollout
-from magnetosuture_thread.geometry.barrier import BUILT_IN, WALL
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.scene import KINDS
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
-from magnetosuture_thread.planning.procedure import GOALS
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.thread import predictor
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
-from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread.prediction import Prediction
-from magnetosuture_thread.thread.solvers import SOLVERS
 from magnetosuture_thread.vision.tracker import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 from test.geometry.scene.scenes import every_shape
@@ -123,7 +112,6 @@ MARGINS = Margins(
 )
 PACKED = {
     "pose": (interface.NEEDLE_POSE, packing.packed_pose(7, TAIL, HEADING, np.eye(3))),
-    "pose before 1970": (interface.NEEDLE_POSE, packing.packed_pose(-7, TAIL, HEADING)),
     "setpoint": (interface.TIP_SETPOINT, packing.packed_pose_stamped(7, TAIL, 0.3)),
     "point": (interface.NEEDLE_TIP, packing.packed_point(7, TAIL)),
     "twist": (interface.NEEDLE_COMMAND, packing.packed_twist(7, TAIL)),
@@ -136,10 +124,8 @@ PACKED = {
     "tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "glare", VIEW))),
     "blind tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "", None))),
     "observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, observation(3, 64))),
-    "empty observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, ThreadObservation())),
     "prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction((0, 3)), "silk")),
     "free prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction(), "")),
-    "estimate": (interface.ESTIMATED_THREAD, packing.packed_estimate(7, an_estimate())),
     "disturbed": (interface.ESTIMATED_THREAD, packing.packed_estimate(7, an_estimate(2))),
     "margins": (interface.MARGINS, packing.packed_margins(7, MARGINS)),
     "no margins": (interface.MARGINS, packing.packed_margins(7, None, "for a reason", "0123456789abcdef")),
@@ -193,31 +179,6 @@ def test_the_frames_of_a_rig_with_a_prefix_are_its_own(prefix: str):
     assert (done.returncode, done.stdout) == (0, f"{prefix}dish {prefix}camera\n"), done.stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "prefix", "words"),
-    [
-        ("BarrierMargin", "", set(BUILT_IN)),
-        ("ThreadForecast", "MARGIN_", set(rollout.KINDS) - set(BUILT_IN)),
-        ("SceneShape", "KIND_", set(KINDS)),
-        ("ThreadMaterial", "ATTACHMENT_", {each.value for each in Attachment}),
-        ("FilterState", "SOURCE_", set(bridge.INPUTS)),
-        ("FilterState", "ACTIVE_", {safety.FRICTION, safety.SPEED, safety.ACCELERATION, WALL}),
-        ("PredictedThread", "FORMULATION_", set(predictor.FORMULATIONS)),
-        ("PredictedThread", "SOLVER_", set(SOLVERS)),
-        (
-            "CoilBridgeState",
-            "DRIVER_",
-            {*CoilBridgeSettings.__dataclass_fields__["driver"].metadata["quantity"].choices, "none"},
-        ),
-        ("ProcedureState", "GOAL_", set(GOALS)),
-    ],
-)
-def test_the_texts_that_messages_may_have_are_constants_of_their_definitions(name: str, prefix: str, words: set[str]):
-    constants = typestore().fielddefs[f"magnetosuture_msgs/msg/{name}"][0]
-    found = {each[0]: each[2] for each in constants if each[1] == "string" and each[0].startswith(prefix)}
-    assert found == {f"{prefix}{word.upper()}": word for word in words}
-
-
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
 def test_a_pose_goes_there_and_back_also_without_a_message(angle: float, x: float, y: float):
     tail, heading = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
@@ -267,11 +228,9 @@ BROKEN: dict[str, Callable[[Any], None]] = {
     "other deviations": lambda m: setattr(m.pieces[0], "deviation", m.pieces[0].deviation[:-1]),
     "a point that is none": lambda m: setattr(m.pieces[0].points[1], "x", math.nan),
     "an end that is none": lambda m: setattr(m.pieces[0], "last_end", 9),
-    "half an interval": lambda m: setattr(m.pieces[0], "arc_length_max", math.nan),
     "complete in two pieces": lambda m: setattr(m, "complete", True),
     "too many pieces": lambda m: setattr(m, "pieces", m.pieces[:1] * (reading.MAX_PIECES + 1)),
     "an outline that is none": lambda m: setattr(m.hidden[0], "corners", m.hidden[0].corners[:2]),
-    "another frame": lambda m: setattr(m.header, "frame_id", "camera"),
 }
 
 
@@ -299,35 +258,6 @@ def test_margins_of_an_estimate_have_bounds_and_go_there_and_back():
         assert least["connectivity"] == -math.inf
     none = topics.MARGINS.decode(packing.packed_margins(7, None, "no pose"))
     assert (none.valid, none.source, none.reason) == (False, SafetyMargins.OF_NOTHING, "no pose")
-
-
-def test_markers_show_the_estimate_beside_the_prediction():
-    estimate = an_estimate(2)
-    predicted = replace(estimate.prediction, positions=estimate.positions + 1e-3)
-    data = markers.packed_thread_markers(7, predicted, estimate.margins, 1e-4, estimate)
-    shown = topics.THREAD_MARKERS.decode(data).markers
-    lines = {each.ns: each for each in shown if each.id == 0}
-    for name, nodes in (("thread", estimate.positions), ("predicted", predicted.positions)):
-        np.testing.assert_array_equal([[point.x, point.y] for point in lines[name].points], nodes)
-    assert len(lines["deviation"].points) == 6 * 6
-    forces = [each for each in shown if each.ns == "disturbances"]
-    assert [each.type for each in forces] == [Marker.ARROW, Marker.TEXT_VIEW_FACING] * 2
-    assert (forces[0].points[1].x, forces[0].points[1].y) == (0.0, -0.5)
-    alone = topics.THREAD_MARKERS.decode(markers.packed_thread_markers(7, None, None, 1e-4, estimate))
-    assert {each.ns for each in alone.markers} == {"thread", "deviation", "disturbances"}
-
-
-def test_the_minimum_of_every_barrier_is_written_beside_its_node():
-    """Also of a barrier that a user added; not of those that hold the segments together, nor of one without rows."""
-    data = markers.packed_thread_markers(7, prediction(), MARGINS, 1e-4)
-    texts = [each for each in topics.THREAD_MARKERS.decode(data).markers if each.ns == "margins"]
-    assert [each.text for each in texts] == ["obstacle -0.00 mm", "own 1.20 mm"]
-    assert texts[0].color.r > texts[1].color.r  # red where it is touched
-    for each, node in zip(texts, (3, 2), strict=True):
-        assert each.pose.position.x == POINTS[node, 0]
-        assert each.lifetime.nanosec > 0  # it goes when the barrier has no row any more
-    hidden = topics.THREAD_MARKERS.decode(markers.packed_thread_markers(7, prediction(), None, 1e-4))
-    assert {each.ns for each in hidden.markers} == {"thread"}
 
 
 def test_the_bags_and_the_graph_have_the_same_own_messages():

@@ -11,6 +11,7 @@ from rclpy.context import Context
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes.parameters import init, settings_of
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
+from magnetosuture_thread.nodes.perception import perception
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.settings.errors import ConfigurationError
 
@@ -61,12 +62,8 @@ def followed(tmp_path: Path, domain: int):
         ([COMMON + "/left_follower: {ros__parameters: {speed: 0.002}}\n" + OWN], LEFT, "/left_follower", 0.004),
         # What comes later counts; rcl merges all by key, and would take 0.004 in the first four.
         ([COMMON + OWN], ("-p", "speed:=0.003"), "/path_follower", 0.003),
-        ([COMMON + OWN, "/**: {ros__parameters: {speed: 0.003}}"], (), "/path_follower", 0.003),
         ([COMMON + OWN], (*LAB1, "-p", "path_follower:speed:=0.003"), "/lab1/path_follower", 0.003),
-        ([COMMON + OWN], (*LEFT, "--param", "left_follower:speed:=0.003"), "/left_follower", 0.003),
         ([COMMON + OWN], ("-p", "other:speed:=0.003"), "/path_follower", 0.004),
-        # Sections of others do not matter.
-        ([COMMON + OWN + "/lab1/camera: {ros__parameters: {exposure: 3}}\n"], LAB1, "/lab1/path_follower", 0.004),
     ],
 )
 def test_what_files_and_command_line_give_a_node(
@@ -83,7 +80,6 @@ def test_what_files_and_command_line_give_a_node(
             LAB1,
             "got '/path_follower', expected one for /lab1/path_",
         ),
-        ("/**/console: {ros__parameters: {rate: 50.0}}", LEFT, "or /left_follower or /**"),
         # The rest would be defaults, which is as bad as nothing that applies.
         (COMMON + "/lab2/path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, /lab2/path_follower'"),
         ("", (), "parameter file: got None, expected sections by node"),
@@ -116,3 +112,14 @@ def test_a_node_knows_the_settings_of_another_by_the_same_files(tmp_path: Path, 
             if node is not None:
                 node.destroy_node()
             context.try_shutdown()
+
+
+def test_a_model_in_one_process_with_the_tracker_hears_the_topic_that_it_is_remapped_to(domain: int):
+    context, remap = Context(), "thread_model:needle/measured_cp:=other/measured_cp"
+    init(["program"], context)
+    nodes = perception(context=context, cli_args=["--ros-args", "-r", remap, "-p", "scene:=dish_35mm"])
+    heard = {entry.topic_name for entry in nodes[1].subscriptions}
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+    assert {"/other/measured_cp", "/thread/observation"} <= heard

@@ -2,46 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.nodes import player, topics
-from magnetosuture_thread.nodes.player import LiveReplay, Losses
+from magnetosuture_thread.nodes.player import LiveReplay
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.interface import NEEDLE_POSE
-
-
-def diagnostics(node: str, **values: int) -> bytes:
-    """Return what a node says of itself."""
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return serialize_message(DiagnosticArray(status=[DiagnosticStatus(name=f"{node}: state", values=pairs)]))
-
-
-def test_losses_are_counted_by_the_way_on_which():
-    losses = Losses()
-    losses.played = Counter({"camera/image_raw/compressed": 10, "needle/servo_cv": 7})
-    losses.count_diagnostics(diagnostics("vision_tracker", frames=8, refused=1))
-    losses.count_diagnostics(diagnostics("thread_model", refused=1))
-    assert losses.frames_waiting
-    for stamp in range(8):
-        losses.heard("needle/measured_cp", stamp, stamp + 1)
-    for stamp in range(5):
-        losses.heard("thread/margins", stamp, stamp + 1)
-        if stamp != 2:
-            losses.heard("thread/predicted", stamp, stamp + 1)
-    assert losses.poses_waiting
-    assert losses.dropped() == {
-        "frames not taken by vision_tracker": 2,
-        "poses without an answer": 2,  # of three, one was refused
-        "outputs lost by the recording": 1,
-    }
 
 
 def test_a_silence_of_54_years_is_left_out_and_named(graph, monkeypatch: pytest.MonkeyPatch):

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
 
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
@@ -42,28 +38,6 @@ def test_the_thread_is_held_until_there_is_a_model_that_follows_it(graph):
     assert places[0] == places[1]
     graph.probe.create_publisher(topics.PREDICTED_THREAD.message, topics.PREDICTED_THREAD.name, 1)
     graph.wait(lambda: threads[-1].poses[-1] != threads[0].poses[-1], "the thread's end to move")
-
-
-def test_frames_come_with_their_truth_and_the_camera(graph):
-    frames, infos = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.CAMERA_INFO)
-    needles, threads, pulls = (graph.listen_later(topic) for topic in topics.GROUND_TRUTH)
-    rig = graph.add(RigSimulatorNode, **SMALL).rig
-    graph.wait(lambda: min(map(len, (frames, infos, needles, threads, pulls))) > 3, "frames and truth")
-    image = cv2.imdecode(np.frombuffer(bytes(frames[-1].data), np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    assert image.shape == (480, 640, 3)
-    assert (infos[-1].width, infos[-1].height) == (640, 480)
-    stamp = nanoseconds(frames[-1].header.stamp)
-    for truth in (needles, threads, pulls):
-        graph.wait(lambda t=truth: stamp in [nanoseconds(each.header.stamp) for each in t], "the truth of a frame")
-    assert needles[-1].pose.position.x == pytest.approx(0.003)
-    assert needles[-1].header.frame_id == "dish"
-    assert len(threads[-1].poses) == 13
-    assert pulls[-1].header.frame_id == "dish"
-    with graph.between_callbacks():
-        frame = rig.look(rig.time, rendered=False)
-    wrench = pulls[-1].wrench
-    assert [wrench.force.x, wrench.force.y, wrench.torque.z] == [*frame.pull.tolist(), frame.moment]
 
 
 def refusals(diagnostics) -> list[str]:
@@ -130,19 +104,3 @@ def test_a_fault_can_be_asked_for_now(graph):
     graph.publish(topics.FAULT_REQUEST, String(data="sunshine 60"))
     graph.wait(lambda: any("expected KIND DURATION" in text for text in refusals(diagnostics)), "a refusal")
     assert [fault.kind for fault in node.rig.faults.faults] == ["glare"]
-
-
-def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):
-    node = graph.add(RigSimulatorNode, **SMALL)
-    frames, diagnostics = graph.listen(topics.CAMERA_INFO), graph.listen(topics.DIAGNOSTICS)
-    graph.wait(lambda: bool(frames), "a frame")
-    before = frames[-1].k[0]
-    other = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.002)),))
-    graph.publish(topics.SCENE, wire.scene_message(0, other))
-    graph.wait(lambda: node.rig.scene.version == other.version, "the other scene")
-    graph.wait(lambda: frames[-1].k[0] < 0.9 * before, "a frame of the wider dish")
-    on_needle = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.006, 0.0), 0.002)),))
-    graph.publish(topics.SCENE, wire.scene_message(0, on_needle))
-    refusal = "scene: got post where the needle is"  # the message may be that of the next frame already
-    graph.wait(lambda: any(refusal in text for text in refusals(diagnostics)), "the refusal")
-    assert node.rig.scene.version == other.version

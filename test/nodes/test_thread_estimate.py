@@ -100,10 +100,7 @@ def test_every_frame_has_an_estimate_beside_the_prediction(bench: Bench):
         assert message.header.stamp == stamp(k)
         assert message.header.frame_id == "dish"
         assert (message.prediction_only, message.unmeasured_for, message.converged) == (False, 0.0, True)
-        assert message.hidden < 0.2
         assert len(message.positions) == len(message.deviation) == 26
-        assert len(message.covariance) == 4 * 26
-        assert 0.0 < message.innovation_squared < 100.0 * message.innovation_degrees
     bench.graph.wait(lambda: len(bench.predicted) == len(bench.margins) == COUNT, "all that comes of the frames")
     assert error(bench.estimated[-1], COUNT - 1) < 0.5 * error(bench.predicted[-1], COUNT - 1)
     assert [each.source for each in bench.margins] == [SafetyMargins.OF_ESTIMATE] * COUNT

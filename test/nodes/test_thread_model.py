@@ -10,7 +10,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from nav_msgs.msg import Path
-from visualization_msgs.msg import Marker
 
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
@@ -46,30 +45,14 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
     last = predicted[-1]
     assert last.header.frame_id == "dish"
     assert last.header.stamp == pose(1.0 + 10 / 30.0).header.stamp
-    assert (last.formulation, last.material, last.solver) == ("rod", "polyamide_7_0", "banded")
     assert len(last.positions) == 26
-    assert len(last.strain) == 25
     assert last.positions[0].x == pytest.approx(1e-3)
     assert last.positions[25].x == pytest.approx(1e-3 - 0.019, abs=1e-6)
     assert max(abs(value) for value in last.strain) < 1e-5
-    assert 0.0 < last.residual < 1e-5
-    assert last.substeps == 2
-    assert last.interval == pytest.approx(1 / 30.0, abs=1e-6)
-    assert 0.0 < last.step_time < 1.0
     graph.wait(lambda: len(margins) >= 11 and len(markers) >= 11, "margins and markers")
     assert margins[-1].valid
     assert margins[-1].contact_state == SafetyMargins.CONTACT_FREE
-    assert len(margins[-1].value) == 50
-    assert [least.barrier for least in margins[-1].minimum] == [
-        "connectivity",
-        "compression",
-    ]
-    assert markers[-1].markers[0].type == Marker.LINE_STRIP
-    assert len(markers[-1].markers[0].points) == 26
-    colour = markers[-1].markers[0].color
-    assert colour.g == max(colour.r, colour.g, colour.b)
     assert margins[-1].friction_state == SafetyMargins.FRICTION_FREE
-    assert margins[-1].slowdown == 1.0
 
 
 def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -92,7 +75,6 @@ def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeyp
     ("spoil", "words"),
     [
         (lambda p: setattr(p.pose.pose.position, "x", math.nan), "finite coordinates"),
-        (lambda p: setattr(p.pose.pose.orientation, "w", 7.0), "a unit quaternion"),
         (lambda p: setattr(p.header, "frame_id", "map"), "'dish'"),
         (lambda p: setattr(p.header, "stamp", stamp(0.9)), "later than"),
     ],

@@ -90,12 +90,3 @@ def test_a_refused_parameter_leaves_all_as_it_was(bench: Bench):
         assert len(reason) < 700
         assert bench.node.settings is bench.node._session.settings is before
     bench.show(2)
-
-
-def test_a_material_that_cannot_be_leaves_an_unconfigured_node_as_it_was(graph):
-    node = graph.add(ThreadModelNode, autostart="unconfigured")
-    node.on_material(ThreadMaterial(name="steel", viscosity=0.7))
-    assert node.get_parameter("material").value == "polyamide_7_0"
-    assert node.get_parameter("viscosity").value == 1.0
-    node.on_material(ThreadMaterial(name="silk_6_0"))
-    assert node.get_parameter("material").value == "silk_6_0"
