@@ -138,6 +138,7 @@ def run(argv: list[str], environment: dict[str, str], log: str) -> NoReturn:
     os.dup2(output, 1)
     os.dup2(output, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also where nohup runs the tests
     sys.argv = argv
     code = 1
     try:
