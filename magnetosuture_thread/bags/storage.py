@@ -17,7 +17,7 @@ import yaml
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import is_url, read_regular
+from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, is_url, read_regular
 from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
 
 CDR = "cdr"  # how ROS 2 writes messages
@@ -29,7 +29,6 @@ SALVAGED_NOTE = "unverified"  # note of a bag that an earlier version salvaged w
 NO_CHECKSUM_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 MAX_SILENCE = 5.0  # s without any message, which a person waits for; longer is a pause, or a clock that was set
 MAX_RECORD_BYTES = 1 << 26  # of a message or a chunk of messages, packed or not
-MAX_TEXT_BYTES = 1 << 20  # of metadata.yaml, where a topic takes 600 bytes
 MAX_QOS_CHARS = 20_000  # of the quality of service of a topic, where a publisher takes 400
 RANGE_BYTES = 1 << 20  # fetched at once, at least, of a file that a URL names
 _CHECKSUM = "crc32"  # note: of all others

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from magnetosuture_thread.coils.allocation import (
+    COIL_ERROR,
+    DIRECTION_DEVIATION,
     CoilAllocation,
+    NeedleMechanics,
 )
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
@@ -21,15 +26,31 @@ EAST = np.array([1.0, 0.0])
 MIDDLE = -0.5 * NEEDLE.length * EAST  # the tail of a needle whose middle is the dish's
 
 
-def allocation(limit: float) -> CoilAllocation:
+def allocation(limit: float = 10.0, needle: NeedleMechanics = NEEDLE) -> CoilAllocation:
     """Return the allocation of four coils around a dish."""
-    return CoilAllocation(COILS, NEEDLE, 0.008, limit)
+    return CoilAllocation(COILS, needle, 0.008, limit)
 
 
 def turned(vector: np.ndarray, angle: float) -> np.ndarray:
     """Return a vector, turned counter-clockwise."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def test_no_velocity_takes_no_current():
+    found = allocation().allocate(np.zeros(2), MIDDLE, EAST)
+    assert found.currents.tolist() == [0.0] * 4
+    assert found.velocity.tolist() == [0.0, 0.0]
+
+
+def test_the_coil_ahead_pulls_and_the_field_lies_along_the_needle():
+    found = allocation().allocate(0.005 * EAST, MIDDLE, EAST)
+    assert found.currents[0] == max(found.currents)
+    field = COILS.per_current(np.zeros(2)) @ found.currents
+    assert field[0] == pytest.approx(0.008, rel=0.5)
+    assert abs(field[1]) < 1e-3 * field[0]
+    np.testing.assert_allclose(found.velocity, [0.005, 0.0], atol=2e-5)
+    assert not found.saturated
 
 
 @given(
@@ -74,6 +95,24 @@ def test_currents_never_leave_their_limits(vx: float, vy: float, x: float, angle
     assert (np.abs(found.currents) <= 3.0).all()
 
 
+@pytest.mark.parametrize("degrees", [-4.0, -1.0, 0.5, 2.5, 4.0])
+def test_close_to_the_axis_of_a_coil_a_pull_across_the_needle_is_compensated_and_the_needle_turns(degrees: float):
+    """A stronger field along the needle would pull it across by its own gradient, by up to twice as much."""
+    settings = read_setup("hernia_ring").coils
+    made, needle = settings.allocation(), settings.needle()
+    e = turned(EAST, np.radians(degrees))
+    n = np.array([-e[1], e[0]])
+    tail = np.array([0.00226, 0.01153]) - 0.5 * needle.chord * e
+    pulled = MotionDisturbance(along=-0.0007, drift=0.0015)
+    wanted = 0.001 * e - 0.0014 * n
+    found = made.allocate(wanted - pulled.velocity(e), tail, e, disturbance=pulled)
+    moved = found.velocity + pulled.velocity(e)
+    assert found.drift == pytest.approx(-pulled.drift, abs=5e-4)
+    assert moved @ e == pytest.approx(wanted @ e, abs=1e-4)
+    assert moved @ n == pytest.approx(wanted @ n, abs=5e-4)
+    assert np.abs(found.currents).max() < settings.max_current
+
+
 @pytest.mark.parametrize("degrees", [86.0, 89.0, 90.0, 91.0, 92.0, 95.0])
 @pytest.mark.parametrize("drift", [-0.004, -0.0015, 0.0015, 0.004])
 def test_however_it_is_pulled_the_field_stays_along_the_needle_and_turns_it_as_commanded(degrees: float, drift: float):
@@ -101,3 +140,22 @@ def test_along_the_axes_of_coils_no_currents_hold_the_needle_and_beside_them_the
             e = turned(EAST, angle)
             drifts.append(made.allocate(-pull.velocity(e), -0.5 * NEEDLE.chord * e, e, disturbance=pull).drift)
         assert drifts == pytest.approx([-1e-3, 0.0, -1e-3], abs=2e-4)
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.08])
+def test_what_is_held_for_each_radian_off_an_axis_turns_the_field_by_no_more_than_a_direction_deviates(distance: float):
+    settings = replace(read_setup("hernia_ring").coils, coil_distance=distance)
+    made, off = settings.allocation(), 0.1
+    axis, held = made.axes()[0]
+    e = turned(EAST, axis + off)
+    tail, pull = -0.5 * settings.needle().chord * e, MotionDisturbance(0.0, off * held)
+    at_rest = made.allocate(1e-6 * e, tail, e, disturbance=MotionDisturbance())
+    against = made.allocate(-pull.velocity(e), tail, e, disturbance=pull)
+    assert against.drift == pytest.approx(-off * held, rel=0.1)
+    field = COIL_ERROR * settings.field_per_current * np.linalg.norm(against.currents - at_rest.currents)
+    assert field / settings.aligning_field == pytest.approx(DIRECTION_DEVIATION, rel=0.2)
+
+
+def test_six_coils_have_no_axis():
+    coils = LoopCoils(coils_around([k * np.pi / 3 for k in range(6)], 0.05, 0.025, 1.2e-3))
+    assert CoilAllocation(coils, NEEDLE, 0.008, 10.0).axes() == ()

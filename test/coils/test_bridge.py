@@ -20,7 +20,7 @@ from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 PERIOD = 0.005
 READY = DriverState(True)
@@ -93,6 +93,13 @@ def stopped_after(plant: Plant, since: float) -> float:
     return max(0.0, moving[-1] + PERIOD - since)
 
 
+def test_while_all_is_well_it_drives():
+    outputs = Plant().ready().run(1.0)
+    assert not any(still(output) for output in outputs[4:])
+    assert outputs[-1].reasons == ()
+    assert outputs[-1].allocation.velocity.tolist() == pytest.approx([0.005, 0.002], rel=0.02)
+
+
 def test_no_false_stops():
     """Twelve seconds of commands and poses that come late, but in time: not one zero."""
     plant = Plant().ready()
@@ -138,6 +145,16 @@ def test_cease_after_stop():
     assert not zeros[-1].publish
     plant.velocity = (0.005, 0.0)
     assert plant.run(0.1)[-1].publish
+
+
+@pytest.mark.parametrize("how_far", ["inactive", "active"])
+def test_inactive_and_disarmed_pass_nothing(how_far: str):
+    plant = Plant()
+    if how_far == "active":
+        plant.bridge.latch.activate()
+    outputs = plant.run(1.0)
+    assert all(still(output) for output in outputs)
+    assert outputs[-1].reasons == ("inactive" if how_far == "inactive" else "disarmed",)
 
 
 @pytest.mark.parametrize("press", ["stop", "disarm", "deactivate", "trip"])
@@ -201,21 +218,22 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
 def driven(
     plant: Plant,
     steps: int,
-    tail: NDArray[np.float64],
     *,
+    tail: NDArray[np.float64] = TAIL,
     pull: NDArray[np.float64] | float = 0.0,
     error: NDArray[np.float64] | float = 0.0,
     latency: int = 0,
+    interval: int = 1,
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield the needle's tail and heading after each step, by what its coils give it.
 
-    It is pulled at a velocity; its poses are off by an error, and come late, in periods, and in every tenth period.
+    It is pulled at a velocity; its poses are off by an error, and come late and seldom, both in periods.
     """
     heading, needle, plant.tail = EAST, plant.settings.needle().kinematics, None
     poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
     for number in range(1, steps):
         poses.append((plant.time, tail, heading))
-        if number > latency and number % 10 == 0:
+        if number > latency and number % interval == 0:
             then, old_tail, old_heading = poses[number - 1 - latency]
             plant.bridge.on_pose(old_tail - error, old_heading, then, number, plant.time, plant.time)
         found = plant.run(PERIOD)[0].allocation
@@ -230,17 +248,26 @@ def driven(
 
 @pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0)])
 @pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
-@pytest.mark.parametrize("pull", [0.0, 1e-3])
-def test_a_needle_whose_motion_is_compensated_comes_no_closer_than_it_may(
-    towards: tuple[float, float], obstacles: tuple[float, ...], pull: float
+@pytest.mark.parametrize(
+    ("compensates", "pull", "latency", "interval"),
+    [(False, 0.0, 0, 1), (False, 0.0, 30, 6), (True, 0.0, 10, 10), (True, 1e-3, 10, 10)],
+)
+def test_the_needle_never_comes_closer_than_it_may(
+    towards: tuple[float, float],
+    obstacles: tuple[float, ...],
+    compensates: bool,
+    pull: float,
+    latency: int,
+    interval: int,
 ):
     """Told to go on for ever, it comes to rest before the wall or the obstacle, also where it is pulled to it."""
-    settings = CoilBridgeSettings(motion_compensation=True)
+    settings = CoilBridgeSettings(motion_compensation=compensates)
     posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
     scene = Scene(Dish(0.035), posts)
     plant = Plant(settings, scene, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
     safety, drag = settings.safety_filter(scene), pull * np.array(towards)
-    motion = driven(plant, 1000, TAIL - np.array([0.004, 0.0]), pull=drag, latency=10)
+    begin = TAIL - np.array([0.004, 0.0])
+    motion = driven(plant, 1000, tail=begin, pull=drag, latency=latency, interval=interval)
     least = min(safety.clearance(tail, heading) for tail, heading in motion)
     assert least > settings.keep_out - 1e-9
     assert least < 0.003  # it did get there
@@ -252,7 +279,7 @@ def test_a_pose_error_within_pose_margin_brings_the_needle_no_closer_than_keep_o
     for margin in (0.0, error):
         settings, scene = CoilBridgeSettings(pose_margin=margin), Scene(Dish(0.035), ())
         plant = Plant(settings, scene, velocity=(0.02, 0.0)).ready()
-        *_, at_end = driven(plant, 800, np.array([0.004, 0.0]), error=error * EAST)
+        *_, at_end = driven(plant, 800, tail=np.array([0.004, 0.0]), error=error * EAST, interval=10)
         tip = settings.needle().kinematics.tip(*at_end)
         least[margin] = scene.dish.radius - math.hypot(*tip) - settings.keep_out
     assert least[0.0] < -0.8 * error
@@ -333,6 +360,25 @@ def test_another_scene_holds_from_the_next_step_on():
     assert np.linalg.norm(after.applied) < 0.6 * np.linalg.norm(before.applied)
 
 
+def test_rejected_scene_leaves_the_previous_one_in_force():
+    plant = Plant().ready()
+    with pytest.raises(ConfigurationError, match="room for the needle"):
+        plant.bridge.set_scene(Scene(Dish(0.006)))
+    assert plant.bridge.scene == Scene()
+    assert not still(plant.run(0.2)[-1])
+
+
+def test_while_a_scene_that_was_heard_is_not_in_force_the_coils_are_at_zero():
+    plant = Plant().ready()
+    plant.run(0.2)
+    plant.bridge.scene_problem = "scene refused: cut off"
+    stopped = plant.run(PERIOD)[0]
+    assert still(stopped)
+    assert stopped.reasons == ("scene refused: cut off",)
+    plant.bridge.scene_problem = ""
+    assert not still(plant.run(0.1)[-1])
+
+
 def test_an_operator_takes_over_by_commanding_and_gives_back_by_silence():
     plant = Plant(velocity=(0.005, 0.0)).ready()
     assert (plant.run(0.2)[-1].source, plant.outputs[-1][1].overridden) == ("needle", "")
@@ -408,6 +454,18 @@ def test_model_and_bridge_on_different_scenes_for_half_a_second_stop_the_needle(
     assert run(0.6, "").reasons == (f"scene: thread_model has none, coil_bridge has {mine}",)
 
 
+def test_a_needle_that_is_commanded_to_move_and_rests_says_what_stops_it():
+    """Against the wall, head on, by the filter."""
+    plant = Plant(velocity=(0.01, 0.0)).ready()
+    keep = plant.settings.keep_out
+    plant.tail = np.array([Scene().dish.radius - keep - plant.settings.needle_length, 0.0])
+    for output in plant.run(0.5)[4:]:
+        assert still(output)
+        assert output.reasons == ("stopped by wall",)
+        assert "wall" in output.active
+        assert output.commanded.tolist() == [0.01, 0.0]
+
+
 def test_a_jump_of_the_pose_is_not_accepted_by_itself_while_armed():
     plant = Plant().ready()
     plant.run(0.2)
@@ -423,6 +481,23 @@ def test_a_jump_of_the_pose_is_not_accepted_by_itself_while_armed():
 
 
 HARDWARE = DriverState(True, timeout=0.2)
+
+
+def frozen(plant: Plant, seconds: float) -> BridgeOutput:
+    """Let a bridge drive, stand still, and go on; return what it does then, with new commands and poses."""
+    plant.run(0.5)
+    plant.time += seconds
+    return plant.run(0.2)[-1]
+
+
+def test_a_bridge_that_stood_still_until_the_boards_stopped_is_in_fault():
+    plant = Plant(driver=HARDWARE).ready()
+    output = frozen(plant, 0.3)
+    assert plant.bridge.latch.fault == "the bridge stood still for 0.30 s: the coils stopped by themselves"
+    assert still(output)
+    plant.bridge.reset(HARDWARE)
+    plant.bridge.arm(HARDWARE)
+    assert not still(plant.run(0.2)[-1])
 
 
 def test_an_operator_may_take_over_from_two_that_dispute_the_needle():

@@ -19,6 +19,7 @@ SETTINGS = CoilBridgeSettings(motion_compensation=True, needle_length=0.0025, ke
 ZERO = SETTINGS.allocation().zero()
 HEADING = 0.6  # rad; off the axes of the coils, where there is a force across the needle
 E = np.array([math.cos(HEADING), math.sin(HEADING)])
+LEFT = np.array([-E[1], E[0]])
 
 
 def blocks(*gaps: float, along: NDArray[np.float64] = E) -> Scene:
@@ -81,6 +82,21 @@ def test_where_currents_are_not_certified_with_what_is_measured_they_are_without
         for more in (disturbance, MotionDisturbance())
     ]
     assert max(shares) >= MIN_SHARE
+
+
+@pytest.mark.parametrize(("place", "gap"), [(-0.089, 3.56e-4), (-0.07, 3.91e-4)])
+def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to_the_wall(place: float, gap: float):
+    """Their drift cannot be avoided close to a coil's axis: the needle turns away from the wall by as much."""
+    settings = CoilBridgeSettings()
+    safety, needle = settings.safety_filter(Scene(Dish(0.035))), settings.needle()
+    out, e = np.array([math.cos(place), math.sin(place)]), np.array([-math.sin(place), math.cos(place)])
+    reach = math.sqrt((0.0175 - settings.keep_out - gap) ** 2 - 0.25 * needle.chord**2)
+    pose = Pose(reach * out - 0.5 * needle.chord * e, e)
+    wanted = safety.filter(0.005 * e + 0.003 * out, pose.tail, pose.heading).filtered
+    coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
+    found, _ = coils.allocate(wanted, pose, safety, ZERO, math.inf, None)
+    assert np.linalg.norm(found.velocity - wanted) < 1.5e-4
+    assert safety.safe_share(found.velocity, pose.tail, pose.heading)[0] > 0.999
 
 
 @pytest.mark.parametrize("speed", [1e-3, -1e-3])

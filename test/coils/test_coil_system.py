@@ -12,7 +12,7 @@ from magnetosuture_thread.coils.drivers import RecordingDriver
 from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 
 @pytest.fixture
@@ -21,6 +21,15 @@ def system() -> CoilSystem:
     made, settings = CoilSystem(), CoilBridgeSettings()
     made.open(settings, CoilBridge(settings, made.latch, Scene()), RecordingDriver(4))
     return made
+
+
+def test_its_end_is_zero_with_the_reason(system):
+    system.step(500.0, 100.0)
+    final = system.close("finalized")
+    assert not final.allocation.currents.any()
+    assert (final.reasons, final.publish) == (("finalized",), True)
+    assert system.closed_reasons == ("finalized",)
+    assert system.close() is None
 
 
 def test_where_arming_cannot_be_recorded_it_does_not_arm(system, tmp_path: Path):
@@ -56,3 +65,16 @@ def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, swit
         system.open(settings, CoilBridge(settings, system.latch, Scene()), RecordingDriver(4))
     system.step(500.0, 100.01)
     assert not system.latch.armed
+
+
+def test_only_barriers_that_were_named_at_the_start_or_imported_by_others_are_taken(system):
+    named, imported, neither = (
+        "not_installed_yet:Bound",
+        "magnetosuture_thread.geometry.barrier:Barrier",
+        "antigravity:Bound",
+    )
+    system.import_barriers([named])
+    system.check_barriers([named, imported])
+    for name in (neither, "not_installed_yet:Another"):
+        with pytest.raises(ConfigurationError, match="named when the node started"):
+            system.check_barriers([named, name])

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import MAX_CHANGE, CoilGainEstimator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.rig.closed_loop import START, ClosedLoop, Measurement
+from magnetosuture_thread.rig.rig import Rig, RigFrame
+from magnetosuture_thread.rig.setups import read_setup
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True, thread_drag=0.0093)
 COILS, NEEDLE = SETTINGS.coil_field(), SETTINGS.needle()
@@ -74,3 +77,33 @@ def test_gains_are_bounded():
     for size in np.linspace(0.0, 3.0, 100):  # slowly, so that each measurement agrees with those before
         place(estimator, np.array([1.0 + size, 1.0, 1.0, 1.0]), random_currents(3, round(1000 * size)))
     assert np.abs(estimator.gains - 1.0).max() <= MAX_CHANGE + 1e-12
+
+
+class LateLoop(ClosedLoop):
+    """Poses arrive 50 to 120 ms after their frame, in order, as on a machine that hardly keeps up."""
+
+    due = 0.0
+    ages = np.random.default_rng(7)
+
+    def _measure(self, frame: RigFrame) -> Measurement | None:
+        measured = super()._measure(frame)
+        if measured is not None:
+            self.due = measured.due = max(self.due, self.now + self.ages.uniform(0.05, 0.12))
+        return measured
+
+
+def test_a_needle_behind_a_clamped_thread_follows_late_poses_and_is_not_stopped():
+    """The thread turns the needle by 0.3 rad from the field. Taken for gains, that reverses the modelled force."""
+    setup = read_setup("petri_35mm_polyamide")
+    follower = setup.follower.follower()
+    loop = LateLoop(
+        setup,
+        Rig(setup.rig, setup.scene),
+        lambda stamp, tail, heading, _: follower.compute_command(stamp, tail, heading).velocity,
+    )
+    fastest = 0.0
+    while loop.now < START + 6.0:
+        frame = loop.step()
+        fastest = max(fastest, math.hypot(*frame.commanded) if frame else 0.0)
+    assert not loop.bridge.latch.latched_reason
+    assert fastest < 0.015  # on a path of 5 mm/s

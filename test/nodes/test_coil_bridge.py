@@ -72,6 +72,19 @@ def test_a_pose_that_grows_old_stops_the_coils_while_commands_go_on(graph):
     graph.wait(is_stopped, "the stop")
 
 
+def test_a_bad_pose_is_not_used(graph):
+    node = armed(graph, **LONG)
+    states, diagnostics = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.DIAGNOSTICS)
+    pose = wire.pose_message(graph.now(), np.zeros(2), EAST)
+    pose.header.frame_id = "map"
+    graph.publish(topics.NEEDLE_POSE, pose)
+    graph.wait(lambda: any("needle/measured_cp" in str(d.status[0].values) for d in diagnostics), "a refusal")
+    graph.publish(topics.NEEDLE_COMMAND, command(graph))
+    graph.wait(lambda: reasons(states) == "no needle pose yet", "the reason")
+    assert states[-1].refused >= 1
+    assert not driven(node)
+
+
 def test_silence_stops_the_coils_and_the_next_command_starts_them(graph):
     node = armed(graph, zero_hold=0.2, pose_timeout=1.0)
     currents, diagnostics = graph.listen(topics.CURRENTS), graph.listen(topics.DIAGNOSTICS)
@@ -109,6 +122,7 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     [
         (lambda m: setattr(m.twist.linear, "x", math.nan), "finite numbers"),
         (lambda m: setattr(m.header, "frame_id", "base_link"), "'dish'"),
+        (lambda m: setattr(m.header, "stamp", Time(sec=5)), "at most 0.1 s"),
         (lambda m: setattr(m.header.stamp, "sec", m.header.stamp.sec + 60), "at most 0.05 s"),
     ],
 )
@@ -122,6 +136,32 @@ def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
     graph.wait(lambda: any(words in str(d.status[0].values) for d in diagnostics), "a refusal")
     assert not driven(node)
     drive_until(graph, lambda: driven(node), "a good command")
+
+
+@pytest.mark.parametrize("offset_ms", [-300, 300])
+def test_the_offset_of_another_hosts_clock_is_measured_and_its_commands_refused(graph, offset_ms):
+    node = armed(graph, pose_timeout=1.0)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
+
+    def age_of(topic: str) -> float:
+        values = {each.key: each.value for each in diagnostics[-1].status[0].values} if diagnostics else {}
+        return float(values.get(f"minimum age of {topic} [ms]", "inf"))
+
+    def minimum_age() -> float:
+        graph.publish(topics.NEEDLE_COMMAND, wire.twist_message(shifted(graph.now(), offset_ms), EAST))
+        return age_of("needle/servo_cv")
+
+    # The age has the transport in it, which on a busy machine takes its time.
+    graph.wait(lambda: -offset_ms <= minimum_age() < 250 - offset_ms, "the offset")
+    assert math.isnan(age_of("operator/servo_cv"))  # nobody commands there
+    assert not driven(node)
+
+
+def shifted(stamp: Time, milliseconds: int) -> Time:
+    """Return a stamp of a clock that is ahead."""
+    nanoseconds = stamp.sec * 10**9 + stamp.nanosec + milliseconds * 10**6
+    return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
 @pytest.mark.parametrize("damaged", [True, False], ids=["damaged", "no room"])

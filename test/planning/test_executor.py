@@ -97,6 +97,34 @@ def test_an_ideal_needle_reaches_every_goal(drift: tuple[float, float]):
     assert math.dist(needle.middle, (-0.006 + 0.5 * NEEDLE.chord, 0.0)) < 1e-3
 
 
+def test_nothing_moves_before_the_start_nor_in_a_pause():
+    run, needle = executor({"go_to": {"position": [-0.01, 0.0]}}), Needle()
+    needle.run(run, 1.0)
+    assert (needle.way, run.state) == (0.0, ProcedureState.READY)
+    run.start()
+    needle.run(run, 1.0)
+    run.pause("the operator has taken over")
+    way = needle.way
+    assert way > 0.0
+    needle.run(run, 2.0)
+    assert (needle.way, run.state) == (way, ProcedureState.PAUSED)
+    run.start()
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.DONE
+
+
+def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    way = needle.way
+    needle.run(run, 2.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
+    assert (run.state, needle.way - way < 1e-5) == (ProcedureState.PAUSED, True)  # held, see `MIN_HOLD_SPEED`
+    assert "not been measured" in run.reason
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.DONE
+
+
 @pytest.mark.parametrize("along", [4e-4, -4e-4])
 def test_a_needle_that_is_pulled_is_kept_in_place_while_the_thread_is_not_known(along: float):
     run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
@@ -176,6 +204,14 @@ def test_a_needle_that_rests_backs_off_and_is_given_up_in_the_end():
     assert not run.update(needle.time, needle.tail, needle.heading, KNOWN).any()
 
 
+def test_a_needle_that_is_held_at_the_wall_is_given_up_with_the_place_and_the_remedy():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle(0.01472, 0.0)
+    needle.share = 0.0
+    run.start()
+    needle.run(run, 60.0)
+    assert "the needle rests beside wall with motion_compensation of the coil bridge off, however" in run.reason
+
+
 def test_a_tightened_thread_ends_its_goal_and_one_that_stays_slack_fails():
     goal = {"tighten": {"tension": 1e-4, "toward": [-0.012, 0.0]}}
     run, needle = executor(goal), Needle()
@@ -188,6 +224,24 @@ def test_a_tightened_thread_ends_its_goal_and_one_that_stays_slack_fails():
     needle.run(run, 60.0)
     assert run.state is ProcedureState.FAILED
     assert "not tight" in run.reason
+
+
+@pytest.mark.parametrize("left", [1e-3, 8e-3])
+def test_a_thread_is_tight_wherever_that_is_on_the_path(left: float):
+    goals: list[dict[str, Any]] = [
+        {"wrap": {"around": "post", "angle": 2.0}},
+        {"tighten": {"tension": 1e-4, "toward": [-0.010, 0.006]}},
+    ]
+    run, needle = executor(*goals), Needle()
+    run.start()
+    needle.run(run, 60.0, until=lambda: run.goal == 1 and run.is_tracking)
+
+    def condition() -> ThreadCondition:
+        tight = run.path is not None and run.path.length - run.travel < left
+        return replace(KNOWN, vertices=needle.thread, tension=2e-4 if tight else 0.0)
+
+    needle.run(run, 60.0, condition)
+    assert (run.state, run.reason) == (ProcedureState.DONE, "")
 
 
 def test_tension_near_its_limit_slows_the_needle_down():
@@ -205,6 +259,15 @@ def test_tension_near_its_limit_slows_the_needle_down():
     needle.run(run, 120.0, condition)
     assert run.state is ProcedureState.DONE
     assert np.percentile(tensions, 95) < 1.1e-4
+
+
+def test_a_shape_that_closes_the_way_fails_the_procedure_with_the_reason():
+    run, needle = executor({"wrap": {"around": "post", "angle": 6.0}}), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    run.set_planner(NeedlePlanner(Scene(Dish()), NEEDLE, 2.5e-4, 0.05))  # the post is gone
+    assert run.state is ProcedureState.FAILED
+    assert "a shape of the scene" in run.reason
 
 
 GOAL_WITH_A_TURN = {"position": [-0.008, -0.004], "heading": [-math.pi / 2.0]}
@@ -246,6 +309,17 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
     assert (needle.way > 1.9 * way) == pauses  # all of the way again, or what was left of it
 
 
+@pytest.mark.slow
+def test_a_thread_that_slips_off_is_wound_again_and_given_up_in_the_end():
+    """The needle goes round, and the thread stays straight: what counts is the thread."""
+    run, needle = executor({"wrap": {"around": "post", "angle": 6.2}}), Needle()
+    run.start()
+    needle.run(run, 600.0, lambda: replace(KNOWN, vertices=np.array([needle.tail, [-0.012, 0.0]])))
+    assert run.state is ProcedureState.FAILED
+    assert "the thread slips on post: it winds" in run.reason
+    assert "of 355 degrees" in run.reason
+
+
 def test_a_wrap_that_has_slipped_off_at_the_end_fails_the_procedure():
     goals: list[dict[str, Any]] = [{"wrap": {"around": "post", "angle": 6.2}}, {"go_to": {"position": [-0.006, 0.004]}}]
     run, needle = executor(*goals), Needle()
@@ -258,6 +332,26 @@ def test_a_wrap_that_has_slipped_off_at_the_end_fails_the_procedure():
     needle.run(run, 300.0, condition)
     assert (run.state, run.goal) == (ProcedureState.FAILED, 1)
     assert "the thread slips on post" in run.reason
+
+
+def test_a_needle_that_is_carried_past_a_gap_goes_back_and_passes_it():
+    """It is where its path ends, but has not crossed the line across the gap."""
+    goals: list[dict[str, Any]] = [
+        {"pass_through": {"between": ["post", "wall"], "direction": [0.0, 1.0]}},
+        {"go_to": {"position": [0.003, 0.008]}},
+    ]
+    run, needle = executor(*goals), Needle(0.010, -0.006, 1.5)
+    run.start()
+    needle.run(run, 60.0, until=lambda: needle.middle[1] > -0.002)
+    assert (run.goal, run.judge.crossed) == (0, 0)
+    for x in np.arange(needle.tail[0], -0.004, -0.004):  # carried around the post on its other side
+        needle.tail = np.array([x, -0.006])
+        needle.run(run, 1.0 / RATE)
+    needle.tail, needle.heading = np.array([-0.004, 0.006]), np.array([1.0, 0.0])
+    needle.run(run, 1.0 / RATE)
+    needle.tail = np.array([0.010, 0.004])
+    needle.run(run, 300.0)
+    assert (run.state, run.reason) == (ProcedureState.DONE, "")
 
 
 def test_a_shape_that_appears_in_a_gap_ahead_fails_the_procedure_and_one_in_a_gap_passed_does_not():

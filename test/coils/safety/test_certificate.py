@@ -13,6 +13,7 @@ from magnetosuture_thread.coils.filter import NeedleSafetyFilter
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 EAST = np.array([1.0, 0.0])
 HOLD = 0.3
@@ -107,6 +108,19 @@ def test_what_lies_between_the_ends_of_a_turn_stops_it():
     assert filtered.safe_share(-velocity, -0.002 * EAST, EAST)[0] == 1.0
 
 
+def test_a_point_is_not_taken_for_a_needle_that_turns():
+    scene, at, velocity = Scene(Dish(0.05)), np.array([0.0, 0.0244]), np.array([0.0, 0.02])
+    turns, lasts = safety(scene, 0.0, turn_time=0.05), safety(scene, 0.0)
+    assert turns.safe_share(velocity, at, EAST) == lasts.safe_share(velocity, at, EAST)
+    assert turns.safe_share(velocity, at, EAST)[0] < 0.1
+
+
+@pytest.mark.parametrize("bad", [-1.0, math.nan])
+def test_a_turn_time_that_is_none_is_refused(bad: float):
+    with pytest.raises(ConfigurationError, match="turn_time"):
+        safety(Scene(), 0.004).limit_turns(bad)
+
+
 def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
     block = SceneShape("block", "wall", Polygon(((-0.01, 0.0), (0.01, 0.0), (0.01, 0.002), (-0.01, 0.002))))
     filtered = safety(Scene(Dish(0.05), (block,)), 0.0)
@@ -155,6 +169,38 @@ def test_around_a_dish_both_ends_slide_at_the_bound():
     velocity = np.array([-0.02 * lever / middle, 0.02])  # forwards, and turned to the left
     assert filtered.safe_share(velocity, np.array([middle, -lever]), np.array([0.0, 1.0]))[0] == 1.0
     assert filtered.safe_share(velocity * [0.9, 1.0], np.array([middle, -lever]), np.array([0.0, 1.0]))[0] < 0.01
+
+
+def test_between_two_points_of_the_needle_a_corner_keeps_out_too():
+    random, worst = np.random.default_rng(3), math.inf
+    for _ in range(40):
+        x = float(random.uniform(-0.003, 0.003))
+        spike = SceneShape("spike", "instrument", Polygon(((x, 0.002), (x + 2e-5, 0.006), (x - 2e-5, 0.006))))
+        scene = Scene(Dish(0.05), (spike,))
+        filtered, needle = safety(scene, 0.007), Needle(0.007, 0.0, 0j, 0.0)
+        # Sidewards, as a motion that is only turned about a far point: many small steps.
+        for _ in range(30):
+            pose = needle.pose()
+            velocity = np.array([0.0, 0.02 if x > 0.0 else -0.02])
+            share, _ = filtered.safe_share(velocity, *pose)
+            needle = needle.moved(complex(*velocity), HOLD * share)
+        worst = min(worst, World(scene).clearance([needle.points()]))
+    assert 5e-4 - 1e-9 < worst < 5.3e-4
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_refused(bad: float):
+    filtered, good = safety(Scene(), 0.007), np.array([0.001, 0.0])
+    for velocity, tail, heading in (
+        (np.array([bad, 0.0]), good, EAST),
+        (good, np.array([0.0, bad]), EAST),
+        (good, good, np.array([bad, 0.0])),
+        (good, good, np.zeros(2)),
+    ):
+        with pytest.raises(InvalidInputError, match=r"finite numbers|a direction"):
+            filtered.filter(velocity, tail, heading)
+        with pytest.raises(InvalidInputError, match=r"finite numbers|a direction"):
+            filtered.safe_share(velocity, tail, heading)
 
 
 @pytest.mark.parametrize("curvature", [0.0, 250.0])
