@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -73,19 +74,28 @@ AROUND_AND_OUT = """
 
 
 def test_a_needle_whose_tip_touches_its_own_thread_is_never_reversed(setup: Setup, camera: DishCamera):
-    """From a campaign: three such frames in a row were taken for a needle the other way round, which it then became."""
-    tracker = VisionTracker(setup.vision, setup.scene)
+    """From a campaign: three such frames in a row were taken for a needle the other way round, which it then became.
+
+    A single frame may be refused, as its noise may make the reversed needle the likelier one; the next is tracked.
+    """
     begin, end = np.array([0.00057, -0.002107, -1.8651]), np.array([0.000355, -0.002528, -1.7036])
-    for frame in range(16):
-        x, y, heading = begin + frame / 12 * (end - begin)
-        tail = np.array([x, y])
-        nodes = np.vstack([tail, 1e-6 * np.array(AROUND_AND_OUT.split(), float).reshape(-1, 2)])
-        at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes, axis=0).T))])
-        thread = CubicSpline(at, nodes)(np.linspace(0.0, at[-1], 161))
-        seen = tracker.track(camera.render(tail, heading, thread), frame / 20)
-        if frame < setup.vision.confirm_frames - 1:
-            continue
-        assert seen.state is State.TRACKED, (frame, seen.reason)
-        turned = np.arctan2(seen.heading[1], seen.heading[0]) - heading
-        assert abs(np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi) < np.radians(10.0)
-        assert np.linalg.norm(seen.tail - tail) < 3.0 * np.sqrt(np.trace(seen.covariance[:2, :2]))
+    first = setup.vision.confirm_frames - 1
+    for _ in range(5):  # the same motion with other noise
+        tracker, refused = VisionTracker(setup.vision, setup.scene), []
+        for frame in range(20):
+            x, y, heading = begin + frame / 12 * (end - begin)
+            tail = np.array([x, y])
+            nodes = np.vstack([tail, 1e-6 * np.array(AROUND_AND_OUT.split(), float).reshape(-1, 2)])
+            at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(nodes, axis=0).T))])
+            thread = CubicSpline(at, nodes)(np.linspace(0.0, at[-1], 161))
+            seen = tracker.track(camera.render(tail, heading, thread), frame / 20)
+            if frame < first:
+                continue
+            if seen.state is not State.TRACKED:
+                refused.append(frame)
+                continue
+            turned = np.arctan2(seen.heading[1], seen.heading[0]) - heading
+            assert abs(np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi) < np.radians(10.0)
+            assert np.linalg.norm(seen.tail - tail) < 3.0 * np.sqrt(np.trace(seen.covariance[:2, :2]))
+        assert len(refused) <= 2
+        assert all(after - before > 1 for before, after in itertools.pairwise(refused))
