@@ -113,7 +113,9 @@ def traffic_of(node: str) -> tuple[set[str], set[str]]:
             if used not in CHANNELS:
                 continue
             method = parent.attr if isinstance(parent, ast.Attribute) else "subscribe"
-            if method == "publisher":
+            if method == "publisher" or (
+                isinstance(parent, ast.Call) and ast.unparse(parent.func) == "topics.publishing"
+            ):
                 published.add(used)
             elif method.startswith("subscribe"):
                 received.add(used)

@@ -22,6 +22,7 @@ from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, s
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.nodes.node import COMPILING
 from magnetosuture_thread.nodes.player import DEPTH, LiveReplay
 from magnetosuture_thread.nodes.processes import (
@@ -31,7 +32,6 @@ from magnetosuture_thread.nodes.processes import (
     graph_environment,
     reserved_domain,
 )
-from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.files import whole_folder

@@ -60,11 +60,7 @@ FIELDS: dict[str, dict[str, Field]] = {
     "select_setup": {"setup": _TEXT},
     "pause": {"paused": _SWITCH},
     "record": {"recording": _SWITCH},
-    "procedure": {
-        "action": _one_of("plan", "resume", "pause", "abort"),
-        "procedure": _TEXT,
-        "hold_to_run": _SWITCH,
-    },
+    "procedure": {"action": _one_of("plan", "resume", "pause", "abort"), "procedure": _TEXT, "hold_to_run": _SWITCH},
     "hold": {"sent": _NUMBER},
     "tip": {"position": (tuple, Quantity("", "m", multiple=2))},
 }

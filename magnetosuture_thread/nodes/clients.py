@@ -43,13 +43,15 @@ TIMEOUT = 10.0  # s for a service to be found and to answer
 POLL_PERIOD = 0.005  # s between two looks at what has come
 DISCOVERY_TIME = 1.0  # s after a node is found, for it to have discovered this client
 
-TRANSITIONS = {
-    "configure": Transition.TRANSITION_CONFIGURE,
-    "activate": Transition.TRANSITION_ACTIVATE,
-    "deactivate": Transition.TRANSITION_DEACTIVATE,
-    "cleanup": Transition.TRANSITION_CLEANUP,
-}
 DONE = "done"
+ACTIONS: dict[str, tuple[Service, Any]] = {
+    "arm": (Service.ARM, SetBool.Request(data=True)),
+    "disarm": (Service.ARM, SetBool.Request(data=False)),
+    "stop": (Service.EMERGENCY_STOP, Trigger.Request()),
+    "reset": (Service.RESET, Trigger.Request()),
+}
+"""What switches the coil bridge: service and request."""
+CHANGE_STATE = "coil_bridge/change_state"
 
 
 class Participant:
@@ -71,10 +73,8 @@ class Participant:
         self._context = Context()
         no_handlers = SignalHandlerOptions.NO
         rclpy.init(context=self._context, domain_id=domain, args=[], signal_handler_options=no_handlers)
-        parameters = [
-            Parameter("start_type_description_service", value=False),
-            Parameter("use_sim_time", value=simulated_clock),
-        ]
+        values = {"start_type_description_service": False, "use_sim_time": simulated_clock}
+        parameters = [Parameter(key, value=value) for key, value in values.items()]
         options: dict[str, Any] = {"parameter_overrides": parameters, "start_parameter_services": False}
         self.node = GuardedNode(name, context=self._context, namespace=namespace, **options)
         self._executor = KeptWaitSetExecutor(context=self._context)
@@ -181,17 +181,13 @@ class Latest:
     def poll(self) -> bool:
         """Read the latest message, if there is one; return whether there is a new value."""
         now = time.monotonic()
-        if now < self._next_read:
-            return False
-        for data, arrived in self._inbox.take():
-            if len(data) > self._max_bytes:
-                return False
-            try:
-                self.value = self._read(self._inbox.topic.decode(data))
-            except Exception:  # whatever is wrong with a message, who asks goes on with the one before
-                return False
-            self._arrived, self._next_read = arrived, now + self._period
-            return True
+        for data, arrived in self._inbox.take() if now >= self._next_read else ():
+            # Whatever is wrong with a message, the one before stays.
+            with suppress(Exception):
+                if len(data) <= self._max_bytes:
+                    self.value = self._read(self._inbox.topic.decode(data))
+                    self._arrived, self._next_read = arrived, now + self._period
+                    return True
         return False
 
     @property
@@ -209,12 +205,12 @@ class Services:
 
     Args:
         node: that calls.
-        kinds: type of each service, by its name.
+        kinds: type of each service, as `std_srvs/srv/Trigger`, by its name.
     """
 
-    def __init__(self, node: Node, kinds: Mapping[str, Any]) -> None:
+    def __init__(self, node: Node, kinds: Mapping[str, str]) -> None:
         self._node = node
-        self._clients = {name: node.create_client(kind, name) for name, kind in kinds.items()}
+        self._clients = {name: node.create_client(topics.ros_class(kind), name) for name, kind in kinds.items()}
 
     def ready(self, name: str) -> bool:
         """Return whether a service is available."""
@@ -254,12 +250,9 @@ class Services:
                 retry_at = now + retry_period
             await asyncio.sleep(POLL_PERIOD)
             self._node.executor.spin_some()
-            for call in calls:
-                if call.done():
-                    return call.result()
-        raise GraphError(
-            f"{name} did not answer within {timeout:g} s" if calls else f"no service {name} within {timeout:g} s"
-        )
+            if answers := [call.result() for call in calls if call.done()]:
+                return answers[0]
+        raise GraphError(f"{f'{name} did not answer' if calls else f'no service {name}'} within {timeout:g} s")
 
 
 class CoilClient(Participant):
@@ -271,12 +264,11 @@ class CoilClient(Participant):
 
     def __init__(self, namespace: str = "") -> None:
         super().__init__("coil_client", namespace=namespace)
-        node = self.node
-        switches: dict[str, Any] = {Service.ARM: SetBool, Service.EMERGENCY_STOP: Trigger, Service.RESET: Trigger}
-        self._services = Services(node, {**switches, "coil_bridge/change_state": ChangeState})
-        self._state = Latest(node, topics.BRIDGE_STATE)
-        self._reports = Inbox(node, topics.DIAGNOSTICS, 10)
-        self._bridge = f"{node.get_namespace()}/coil_bridge".lstrip("/")
+        kinds: dict[str, str] = {service: service.type_name for service, _ in ACTIONS.values()}
+        self._services = Services(self.node, {**kinds, CHANGE_STATE: "lifecycle_msgs/srv/ChangeState"})
+        self._state = Latest(self.node, topics.BRIDGE_STATE)
+        self._reports = Inbox(self.node, topics.DIAGNOSTICS, 10)
+        self._bridge = f"{self.node.get_namespace()}/coil_bridge".lstrip("/")
 
     def execute(self, action: str) -> str:
         """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
@@ -288,21 +280,19 @@ class CoilClient(Participant):
             GraphError: no bridge was found, or it rejects the command.
         """
         message = ""
-        if action in TRANSITIONS:
-            # Called once, so the bridge must have discovered this client too, or its answer is lost.
-            self._wait_for_state()
-            time.sleep(DISCOVERY_TIME)
-            request = ChangeState.Request(transition=Transition(id=TRANSITIONS[action]))
-            if not self._call("coil_bridge/change_state", request, retry_period=math.inf).success:
-                raise GraphError(f"the bridge rejected {action}: not possible in its state, or see its log")
-        else:
-            name = {"stop": Service.EMERGENCY_STOP, "reset": Service.RESET}.get(action, Service.ARM)
-            answer = self._call(
-                name, SetBool.Request(data=action == "arm") if name == Service.ARM else Trigger.Request()
-            )
+        if action in ACTIONS:
+            answer = self._call(*ACTIONS[action])
             message = shortened(answer.message, MAX_REASON_CHARS)
             if not answer.success:
                 raise GraphError(message)
+        else:
+            # Called once, so the bridge must have discovered this client too, or its answer is lost.
+            self._wait_for_state()
+            time.sleep(DISCOVERY_TIME)
+            transition = Transition(id=getattr(Transition, f"TRANSITION_{action.upper()}"))
+            request = ChangeState.Request(transition=transition)
+            if not self._call(CHANGE_STATE, request, retry_period=math.inf).success:
+                raise GraphError(f"the bridge rejected {action}: not possible in its state, or see its log")
         time.sleep(0.15)  # for the bridge to publish its new state
         return message
 
@@ -341,12 +331,9 @@ class CoilClient(Participant):
         return (median, p99, maximum), values[SCHEDULING]
 
     def _timing_values(self) -> dict[str, str] | None:
-        for report, _ in self._reports.read():
-            for status in report.status:
-                values = read_status(status)[1] if status.name.startswith(f"{self._bridge}:") else {}
-                if SCHEDULING in values:
-                    return values
-        return None
+        statuses = (status for report, _ in self._reports.read() for status in report.status)
+        ours = (read_status(status)[1] for status in statuses if status.name.startswith(f"{self._bridge}:"))
+        return next((values for values in ours if SCHEDULING in values), None)
 
     def _wait_for_state(self) -> CoilBridgeState:
         def latest() -> Any:

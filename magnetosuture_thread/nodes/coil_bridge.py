@@ -29,8 +29,6 @@ from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode
 from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
 
-INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
-
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     """Drives the coils by filtered velocity commands while active and armed, and with zeros otherwise.
@@ -40,6 +38,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     """
 
     stands_by = False  # it reports what it does, in any state
+    input_errors = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
 
     def __init__(self, **options: Any) -> None:
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
@@ -54,10 +53,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._refused = 0
         self._last_state: object = None
         self._last_log = ""
-        self._setpoints = topics.NEEDLE_SETPOINT.publisher(self)
-        self._currents = topics.CURRENTS.publisher(self)
-        self._states = topics.BRIDGE_STATE.publisher(self)
-        self._filter = topics.FILTER_STATE.publisher(self)
+        self._currents, self._setpoints = topics.CURRENTS.publisher(self), topics.NEEDLE_SETPOINT.publisher(self)
+        self._states, self._filter = topics.BRIDGE_STATE.publisher(self), topics.FILTER_STATE.publisher(self)
         self._rig = topics.RIG_CURRENTS.publisher(self)
         self.create_timer(0.1, lambda: self._publish_state(force=True), clock=self._steady)
         # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
@@ -82,7 +79,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
         driver = make_driver(settings, len(bridge.coils), self._send_to_rig, self._count_rigs)
         self.system.open(settings, bridge, driver)
-        self.held(self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady))
+        self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
 
     def activate(self) -> None:
         """Activate, so that the bridge can be armed."""
@@ -133,24 +130,16 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def on_pose(self, message: PoseWithCovarianceStamped, number: int) -> None:
         """Register a needle pose, for the next currents."""
-        if self.system.bridge is None:
-            return
-        try:
-            pose = reading.needle_pose(message)
-            covariance = reading.pose_covariance(message)
+        if self.system.bridge is not None:
+            pose, covariance = reading.needle_pose(message), reading.pose_covariance(message)
             self.system.bridge.on_pose(pose.tail, pose.heading, pose.stamp, number, *self._times(), covariance)
-        except INPUT_ERRORS as error:
-            self.refuse(error)
 
     def on_margins(self, message: SafetyMargins) -> None:
         """Register the thread's margins: slowdown by friction, and the scene of the prediction."""
-        if (bridge := self.system.bridge) is None:
-            return
-        try:
+        if self.system.bridge is not None:
             stamp = reading.checked_nanoseconds(message.header.stamp, "thread/margins.header.stamp") * 1e-9
-            bridge.on_margins(stamp, message.valid, message.slowdown, message.scene_version, self._times()[1])
-        except INPUT_ERRORS as error:
-            self.refuse(error)
+            prediction = stamp, message.valid, message.slowdown, message.scene_version
+            self.system.bridge.on_margins(*prediction, self._times()[1])
 
     def on_scene(self, scene: Scene) -> None:
         """Replace the scene, from the next step on."""
@@ -170,7 +159,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             velocity = reading.plane_velocity(message, INPUTS[source])
             stamp = reading.checked_nanoseconds(message.header.stamp, f"{INPUTS[source]}.header.stamp") * 1e-9
             self.system.bridge.command(source, velocity, stamp, number, *self._times())
-        except INPUT_ERRORS as error:
+        except self.input_errors as error:
             self.refuse(error)
         else:
             self._stamps[source] = message.header.stamp

@@ -1,4 +1,7 @@
-"""The node `console`: serves the operator page for a running graph; states in, jog commands and services out."""
+"""The node `console`: serves the operator page for a running graph; states in, jog commands and services out.
+
+What the page is told of each message is at the end: pure functions that return plain types.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +14,29 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
+from magnetosuture_msgs import msg
 from magnetosuture_msgs.srv import PlanProcedure
+from nav_msgs.msg import Path
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
-from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import MagnetosutureError, read_scene
+from magnetosuture_thread import Disc, InvalidInputError, MagnetosutureError, Scene, SceneShape, read_scene
+from magnetosuture_thread.bags.markers import forecast_events
 from magnetosuture_thread.bags.packing import packed_header, packed_point, packed_twist
+from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose
+from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.nodes import console_state as page
+from magnetosuture_thread.estimator.disturbance import disturbance_text
+from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox, Latest, Services
+from magnetosuture_thread.nodes.clients import ACTIONS, Inbox, Latest, Services
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
 from magnetosuture_thread.nodes.parameters import declare, init
@@ -37,39 +47,20 @@ from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError, shortened
 from magnetosuture_thread.settings.files import shipped_names
 from magnetosuture_thread.settings.interface import Service
+from magnetosuture_thread.thread.margins import node_clearance
 from magnetosuture_thread.vision.images import image_of
 
 NAME = "console"
 RIG = "rig_simulator"
 DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
 MAX_NODES = 32  # shown
+MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
+MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
 
-ACTIONS: dict[str, tuple[str, Any]] = {
-    "arm": (Service.ARM, SetBool.Request(data=True)),
-    "disarm": (Service.ARM, SetBool.Request(data=False)),
-    "stop": (Service.EMERGENCY_STOP, Trigger.Request()),
-    "reset": (Service.RESET, Trigger.Request()),
-}
 PROCEDURE_ACTIONS = {
     "resume": Service.RESUME_PROCEDURE,
     "pause": Service.PAUSE_PROCEDURE,
     "abort": Service.ABORT_PROCEDURE,
-}
-# Parts of the state: the topic, what reads its messages, how seldom [s], and whether the part has its age. Paths and
-# forecasts take a millisecond to read, a large scene more.
-READERS = {
-    "tracker": (topics.TRACKER_STATE, page.tracker, 0.0, True),
-    "needle": (topics.NEEDLE_POSE, page.needle, 0.0, True),
-    "measured": (topics.MEASURED_THREAD, page.measured_thread, 0.1, False),
-    "predicted": (topics.PREDICTED_THREAD, page.predicted, 0.0, True),
-    "estimated": (topics.ESTIMATED_THREAD, page.estimated, 0.0, True),
-    "forecast": (topics.FORECAST, page.forecast, 0.1, True),
-    "margins": (topics.MARGINS, page.margins, 0.0, False),
-    "scene": (topics.SCENE, page.scene, 0.5, False),
-    "filter": (topics.FILTER_STATE, page.filter_state, 0.0, True),
-    "bridge": (topics.BRIDGE_STATE, page.bridge, 0.0, True),
-    "procedure": (topics.PROCEDURE_STATE, page.procedure, 0.0, False),
-    "plan": (topics.PROCEDURE_PLAN, page.plan, 0.0, False),
 }
 RECORDED_TOPICS = tuple(
     dict.fromkeys((*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *topics.PROCEDURES))
@@ -83,7 +74,7 @@ class ConsoleGraph:
 
     Args:
         node: in the graph, and in an executor that nobody else spins.
-        settings: of the page.
+        settings: of the
 
     Attributes:
         node: as given.
@@ -99,8 +90,7 @@ class ConsoleGraph:
         self.node = node
         self.blocked = ""
         offered_by = ("coil_bridge", interface.PLANNER, "replay", RIG)
-        called = [each for each in Service if each.node in offered_by]
-        self.services = Services(node, {each: topics.ros_class(each.type_name) for each in called})
+        self.services = Services(node, {name: name.type_name for name in Service if name.node in offered_by})
         self._action = 0  # number of the latest
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
@@ -186,18 +176,17 @@ class ConsoleGraph:
         for name in ("measured", "plan"):
             parts[name] = parts[name] or []
         if self.blocked:
-            rest = {"commanded": [0.0, 0.0], "filtered": [0.0, 0.0], "applied": [0.0, 0.0]}
+            rest = {name: [0.0, 0.0] for name in ("commanded", "filtered", "applied")}
             why = {"active": [], "overridden": "", "reason": self.blocked}
             parts["filter"] = {"source": "", **rest, "slowdown": 1.0, **why, "age": 0.0}
-        shown_scene = parts["scene"] or self._scene
-        shapes = {shape["name"] for shape in shown_scene["shapes"]} if shown_scene else set()
+        parts["scene"] = parts["scene"] or self._scene
+        shapes = {shape["name"] for shape in parts["scene"]["shapes"]} if parts["scene"] else set()
         return {
             "time": self.now().nanoseconds * 1e-9,
             "needle_length": self.settings.needle_length,
             "needle_curvature": self.settings.needle_curvature,
             **parts,
             "camera": None if self._camera.value is None else {"age": self._camera.age},
-            "scene": shown_scene,
             "procedures": [name for name, needed in self._procedures.items() if needed <= shapes],
             "nodes": self.nodes(),
         }
@@ -212,25 +201,23 @@ class ConsoleGraph:
         space, now = self.node.get_namespace().strip("/"), time.time_ns()
         for report, arrived in self._reports.read():
             for status in report.status[:MAX_NODES]:
-                name = _name_within(space, shortened(status.name.split(":")[0]))
-                if name:
-                    self._diagnostics[name] = (page.node_state(status), arrived)
-        others = sorted(
-            self._diagnostics.keys() - set(interface.ALL_NODES), key=lambda name: self._diagnostics[name][1]
-        )
-        for number, name in enumerate(others):
-            too_many = number < len(others) + len(interface.ALL_NODES) - MAX_NODES
-            if too_many or now - self._diagnostics[name][1] > DROP_TIMEOUT * 1e9:
-                del self._diagnostics[name]
-        found: dict[str, dict[str, Any]] = {}
-        for name, (status, arrived) in sorted(self._diagnostics.items()):
+                if name := _name_within(space, shortened(status.name.split(":")[0])):
+                    self._diagnostics[name] = (node_state(status), arrived)
+        arrivals = {name: arrived for name, (_, arrived) in self._diagnostics.items()}
+        others = sorted(arrivals.keys() - set(interface.ALL_NODES), key=arrivals.__getitem__)
+        surplus = max(0, len(others) + len(interface.ALL_NODES) - MAX_NODES)
+        late = [name for name in others[surplus:] if now - arrivals[name] > DROP_TIMEOUT * 1e9]
+        for name in (*others[:surplus], *late):
+            del self._diagnostics[name]
+        nodes: dict[str, dict[str, Any]] = {}
+        for name, (state, arrived) in sorted(self._diagnostics.items()):
             age = max(0.0, (now - arrived) * 1e-9)
-            found[name] = {**status, "level": "silent" if age > 3.0 else status["level"], "age": age}
-        return found
+            nodes[name] = {**state, "level": "silent" if age > 3.0 else state["level"], "age": age}
+        return nodes
 
     def is_active(self, name: str) -> bool:
         """Return whether a node publishes diagnostics now."""
-        return any(node == name and about["level"] != "silent" for node, about in self.nodes().items())
+        return self.nodes().get(name, {"level": "silent"})["level"] != "silent"
 
     def frame(self) -> tuple[int, bytes] | None:
         """Return number and JPEG or PNG bytes of the latest camera frame; a raw one is encoded here."""
@@ -256,8 +243,7 @@ class ConsoleGraph:
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, 50)
         self._diagnostics: dict[str, tuple[dict[str, Any], int]] = {}
         raw = settings.image_transport == "raw"
-        image, read = (topics.IMAGE, _encoded) if raw else (topics.COMPRESSED_IMAGE, _compressed)
-        self._camera = Latest(self.node, image, read)
+        self._camera = Latest(self.node, topics.IMAGE if raw else topics.COMPRESSED_IMAGE, _jpeg if raw else _bytes)
 
 
 def _name_within(space: str, name: str) -> str:
@@ -273,14 +259,14 @@ def _name_within(space: str, name: str) -> str:
 
 def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:
     """Return the scene to show until one is received; None where the settings name none."""
-    return page.shown_scene(read_scene(settings.scene)) if settings.scene else None
+    return shown_scene(read_scene(settings.scene)) if settings.scene else None
 
 
-def _compressed(message: CompressedImage) -> bytes:
+def _bytes(message: Any) -> bytes:
     return bytes(message.data)
 
 
-def _encoded(message: Image) -> bytes:
+def _jpeg(message: Any) -> bytes:
     return encode_jpeg(image_of(message), 80).tobytes()
 
 
@@ -301,17 +287,9 @@ class GraphHost:
         """Return what is running and which requests are possible; see `console.client.Host`."""
         can_pause = bool(self._pause_service())
         self.paused = self.paused and can_pause
-        return {
-            "mode": self.mode,
-            "setup": "",
-            "setups": [],
-            "can_pause": can_pause,
-            "paused": self.paused,
-            "can_record": False,
-            "recording": "",
-            "busy": "",
-            "simulated": self.graph.is_active(RIG),
-        }
+        texts = {"mode": self.mode, "setup": "", "setups": [], "recording": "", "busy": ""}
+        possible = {"can_pause": can_pause, "paused": self.paused, "can_record": False}
+        return {**texts, **possible, "simulated": self.graph.is_active(RIG)}
 
     async def select_setup(self, setup: str) -> str:
         """Refuse: this graph is not started from the page."""
@@ -319,8 +297,7 @@ class GraphHost:
 
     async def set_paused(self, paused: bool) -> str:
         """Pause or resume time if a node of the graph can; return the reason of a refusal."""
-        name = self._pause_service()
-        if not name:
+        if not (name := self._pause_service()):
             return "no node of this graph can pause time"
         refusal = await self.graph.call(name, SetBool.Request(data=paused))
         if not refusal:
@@ -333,10 +310,8 @@ class GraphHost:
 
     def _pause_service(self) -> str:
         """Return the service that pauses time; empty if there is none."""
-        return next(
-            (name for name in (Service.PAUSE_REPLAY, Service.PAUSE_RIG) if self.graph.services.ready(name)),
-            "",
-        )
+        pauses = (Service.PAUSE_REPLAY, Service.PAUSE_RIG)
+        return next((name for name in pauses if self.graph.services.ready(name)), "")
 
 
 async def _serve(node: GuardedNode, settings: ConsoleSettings) -> None:
@@ -378,3 +353,220 @@ def main(arguments: list[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
+    """Return the needle's tail [m], the angle of its heading there [rad], and whether that is not the opposite one.
+
+    Raises:
+        InvalidInputError: the pose is none in the dish plane.
+    """
+    pose = needle_pose(message, directed=False)
+    return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading), "directed": heading_known(message)}
+
+
+def tracker(message: msg.TrackerState) -> dict[str, Any]:
+    """Return the tracker's state, and the dish's place in the image if known."""
+    view, scale = None, message.metres_per_pixel
+    if len(message.dish_centre) == 2 and scale > 0.0:
+        view = {"centre": list(message.dish_centre), "scale": scale, "rotation": message.camera_rotation}
+    state = constant_name(message, message.state, "STATE_", "searching")
+    return {"state": state, **_plain(message, "reason confidence"), "view": view}
+
+
+def measured_thread(message: Path) -> list[list[float]]:
+    """Return the vertices of the measured centreline [m]."""
+    return _points(placed.pose.position for placed in message.poses)
+
+
+def predicted(message: msg.PredictedThread) -> dict[str, Any]:
+    """Return the predicted vertices [m], how they were found, and the forces [N]: tensions, pull on the needle.
+
+    Raises:
+        InvalidInputError: the tensions are not those of the segments between the vertices.
+    """
+    tension = list(message.tension)
+    if tension and len(tension) + 1 != len(message.positions):
+        found = f"{len(message.positions)} positions and {len(tension)} tensions"
+        raise InvalidInputError("thread/predicted", found, "a tension for each segment, or none")
+    return {
+        "tension": tension,
+        "needle_force": [message.needle_force.x, message.needle_force.y] if tension else None,
+        "vertices": _points(message.positions),
+        **_plain(message, "residual step_time"),
+        "status": shortened(message.solver_status),
+    }
+
+
+def estimated(message: msg.EstimatedThread) -> dict[str, Any]:
+    """Return the estimated vertices with their deviations [m], how they were found, and the forces that were found.
+
+    Raises:
+        InvalidInputError: the deviations are not those of the vertices.
+    """
+    if len(message.deviation) != len(message.positions):
+        found = f"{len(message.positions)} positions and {len(message.deviation)} deviations"
+        raise InvalidInputError("thread/estimated", found, "a deviation for each position")
+    return {
+        "vertices": _points(message.positions),
+        "deviation": list(message.deviation),
+        **_plain(message, "prediction_only unmeasured_for hidden"),
+        "disturbances": [_disturbance(force) for force in message.disturbances[:MAX_LISTED]],
+    }
+
+
+def _disturbance(message: msg.ThreadDisturbance) -> dict[str, Any]:
+    direction = [message.direction.x, message.direction.y]
+    text = disturbance_text(message.arc_length, message.force, (direction[0], direction[1]))
+    position = [message.position.x, message.position.y]
+    return {"position": position, "direction": direction, "force": message.force, "text": text}
+
+
+def forecast(message: msg.ThreadForecast) -> dict[str, Any]:
+    """Return where the thread will be at some instants, the last that of the horizon, and what happens when.
+
+    Raises:
+        InvalidInputError: the positions are not those of equally many nodes at each instant.
+    """
+    instants, count = len(message.time), len(message.positions)
+    if not instants or count % instants or count // instants > MAX_THREAD_NODES:
+        found = f"{count} positions and {instants} instants"
+        raise InvalidInputError("thread/forecast", found, "as many positions at each instant")
+    nodes = count // instants
+    shown = sorted({round(index) for index in np.linspace(0, instants - 1, 4)[1:]})
+    vertices = {at: _points(message.positions[at * nodes : (at + 1) * nodes]) for at in shown}
+    ghosts = [{"time": message.time[at], "vertices": vertices[at]} for at in shown]
+    shape = shortened(message.contact_shape)
+    events = forecast_events(message.contact_time, shape, message.friction_time, message.rest_time)
+    return {"horizon": message.horizon, "ghosts": ghosts, "events": events, "problem": shortened(message.problem)}
+
+
+def margins(message: msg.SafetyMargins) -> dict[str, Any]:
+    """Return the margins by node and by kind, as distances [m]; no number of a message that is not valid."""
+    bounds = [barrier.clearance_bound for barrier in message.minimum if np.isfinite(barrier.clearance_bound)]
+    friction = constant_name(message, message.friction_state, "FRICTION_")
+    return {
+        "valid": message.valid,
+        "of": constant_name(message, message.source, "OF_", "nothing"),
+        "reason": shortened(message.reason),
+        "clearance": clearances(message) if message.valid else [],
+        "least": {shortened(barrier.barrier): barrier.clearance for barrier in message.minimum[:MAX_LISTED]},
+        "bound": min(bounds, default=None),
+        "contact": list(message.contact_nodes),
+        "friction": {"state": friction, "nodes": list(message.friction_nodes), "slowdown": message.slowdown},
+    }
+
+
+def clearances(message: msg.SafetyMargins) -> list[float | None]:
+    """Return each node's minimum clearance of the wall and any shape [m]; None where none is near.
+
+    Raises:
+        InvalidInputError: a node that no thread has.
+    """
+    count = max(message.node, default=-1) + 1
+    if count > MAX_THREAD_NODES:
+        raise InvalidInputError("thread/margins.node", count - 1, f"less than {MAX_THREAD_NODES}")
+    return [value if value < np.inf else None for value in node_clearance(margins_of(message), count).tolist()]
+
+
+def scene(message: msg.Scene) -> dict[str, Any]:
+    """Return the scene of a message as the page draws it.
+
+    Raises:
+        InvalidInputError: the message is damaged.
+    """
+    return shown_scene(parse_scene_message(message))
+
+
+def shown_scene(shown: Scene) -> dict[str, Any]:
+    """Return a scene as the page draws it: discs as x, y and radius, others as outline and holes [m]."""
+    tolerance = 2e-4 * shown.dish.diameter  # a fifth of a pixel
+    dish = {"dish_diameter": shown.dish.diameter, "dish_depth": shown.dish.depth}
+    return {"version": shown.version, **dish, "shapes": [_shown_shape(shape, tolerance) for shape in shown.shapes]}
+
+
+def _shown_shape(shape: SceneShape, tolerance: float) -> dict[str, Any]:
+    shown: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "label": list(shape.label_point)}
+    if isinstance(shape.geometry, Disc):
+        return {**shown, "disc": [*shape.geometry.centre, shape.geometry.radius]}
+    # 30 times a second, for every page: no digit too many.
+    outline, *holes = [np.round(ring, 7).tolist() for ring in shape.outlines(tolerance)]
+    return {**shown, "outline": outline, "holes": holes}
+
+
+def filter_state(message: msg.FilterState) -> dict[str, Any]:
+    """Return what the bridge made of the last velocity command [m/s]."""
+    return _plain(message, "source commanded filtered applied slowdown active overridden reason")
+
+
+def bridge(message: msg.CoilBridgeState) -> dict[str, Any]:
+    """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
+    state = constant_name(message, message.state, "STATE_", "fault")
+    motion = "armed emergency_stopped reasons commanded filtered applied saturated"
+    return {
+        "state": state,
+        **_plain(message, motion),
+        **_plain(message, "driver driver_ready driver_warnings current measured_current refused"),
+    }
+
+
+def procedure(message: msg.ProcedureState) -> dict[str, Any]:
+    """Return what the needle planner does."""
+    return {
+        "state": constant_name(message, message.state, "STATE_", "failed"),
+        "name": shortened(message.procedure),
+        **_plain(message, "goals goal goals_met progress resumes hold_to_run"),
+        "reason": shortened(message.reason, 400),
+        "clearance": message.clearance if np.isfinite(message.clearance) else None,
+    }
+
+
+def plan(message: Path) -> list[list[float]]:
+    """Return where the middle of the needle is to go [m]; of a long way every second place, or fewer."""
+    points = measured_thread(message)
+    return points[:: 1 + len(points) // 400]
+
+
+def node_state(status: DiagnosticStatus) -> dict[str, Any]:
+    """Return a node's diagnostic status."""
+    levels = {DiagnosticStatus.OK: "ok", DiagnosticStatus.WARN: "warn", DiagnosticStatus.STALE: "silent"}
+    return {
+        "level": levels.get(status.level, "error"),
+        "message": shortened(status.message),
+        "values": {shortened(pair.key): shortened(pair.value) for pair in status.values[:MAX_LISTED]},
+    }
+
+
+def _plain(message: Any, names: str) -> dict[str, Any]:
+    """Return fields of a message, by their names, as plain values: texts and lists shortened, vectors in the plane."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, str):
+            return shortened(value)
+        if isinstance(value, Vector3):
+            return [value.x, value.y]
+        return value if isinstance(value, (bool, int, float)) else [plain(entry) for entry in value[:MAX_LISTED]]
+
+    return {name: plain(getattr(message, name)) for name in names.split()}
+
+
+def _points(positions: Any) -> list[list[float]]:
+    return [[place.x, place.y] for place in positions]
+
+
+# Parts of the state: the topic, what reads its messages, how seldom [s], and whether the part has its age. Paths and
+# forecasts take a millisecond to read, a large scene more.
+READERS = {
+    "tracker": (topics.TRACKER_STATE, tracker, 0.0, True),
+    "needle": (topics.NEEDLE_POSE, needle, 0.0, True),
+    "measured": (topics.MEASURED_THREAD, measured_thread, 0.1, False),
+    "predicted": (topics.PREDICTED_THREAD, predicted, 0.0, True),
+    "estimated": (topics.ESTIMATED_THREAD, estimated, 0.0, True),
+    "forecast": (topics.FORECAST, forecast, 0.1, True),
+    "margins": (topics.MARGINS, margins, 0.0, False),
+    "scene": (topics.SCENE, scene, 0.5, False),
+    "filter": (topics.FILTER_STATE, filter_state, 0.0, True),
+    "bridge": (topics.BRIDGE_STATE, bridge, 0.0, True),
+    "procedure": (topics.PROCEDURE_STATE, procedure, 0.0, False),
+    "plan": (topics.PROCEDURE_PLAN, plan, 0.0, False),
+}

@@ -11,9 +11,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from magnetosuture_msgs import msg
 from magnetosuture_msgs.action import ExecuteProcedure
-from magnetosuture_msgs.msg import CoilBridgeState, EstimatedThread, PredictedThread, SafetyMargins, TrackerState
 from magnetosuture_msgs.msg import ProcedureState as StateMessage
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
@@ -28,17 +28,12 @@ from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, ManagedNode, SceneFollower, reason_of
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, ManagedNode, SceneFollower, reason_of
 from magnetosuture_thread.nodes.parameters import settings_of
+from magnetosuture_thread.planning import session
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
-from magnetosuture_thread.planning.session import (
-    NeedlePlannerSettings,
-    ProcedureSession,
-    ProcedureStatus,
-    compile_planning,
-)
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import shortened
 from magnetosuture_thread.settings.interface import Service
@@ -46,55 +41,62 @@ from magnetosuture_thread.settings.interface import Service
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
 
 
-class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
+class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
     """Commands the needle along planned paths, at every pose; without poses the coil bridge times out.
 
-    A thread of its own plans, for up to some seconds, while the needle is kept in place. The operator is above it:
-    any message on `operator/servo_cv` pauses the procedure until `procedure/resume`. Deactivated, the node gives the
-    procedure up, the needle at rest.
+    A worker plans, for up to some seconds, while the needle is kept in place. The operator is above it: any message on
+    `operator/servo_cv` pauses the procedure until `procedure/resume`. Deactivated, the node gives the procedure up, the
+    needle at rest.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(interface.PLANNER, NeedlePlannerSettings, **options)
+        super().__init__(interface.PLANNER, session.NeedlePlannerSettings, **options)
         self._coils = settings_of(self, CoilBridgeSettings, options)
         self._model = settings_of(self, ThreadModelSettings, options)
         self._planning = ThreadPoolExecutor(1)
         self._moving = False  # whether the last command was not zero
+        self._action: ProcedureAction | None = None
         self._scene = SceneFollower(self, self.on_scene)
         self.start()
 
-    def allocate(self, settings: NeedlePlannerSettings) -> None:
+    def allocate(self, settings: session.NeedlePlannerSettings) -> None:
         """Load the planner's kernels, and offer what it does."""
         scene = self._scene.load(settings.scene)
-        self._session = ProcedureSession(settings, scene, self._planning.submit, self._coils, self._model)
+        self._session = session.ProcedureSession(settings, scene, self._planning.submit, self._coils, self._model)
         with self.health.load("the planner's kernels"):
-            compile_planning()
-        self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))
-        self._setpoints = self.held(topics.TIP_SETPOINT.publisher(self))
-        self._states = self.held(topics.PROCEDURE_STATE.publisher(self))
-        self._plans = self.held(topics.PROCEDURE_PLAN.publisher(self))
+            session.compile_planning()
+        self._commands, self._setpoints = topics.NEEDLE_COMMAND.publisher(self), topics.TIP_SETPOINT.publisher(self)
+        self._states, self._plans = topics.PROCEDURE_STATE.publisher(self), topics.PROCEDURE_PLAN.publisher(self)
         self._published: tuple[Any, ...] = ()
         self._published_at = -math.inf
-        self._read_due: dict[str, float] = {}  # when the next message of a thread is read while nothing is executed [s]
-        self.held(topics.BRIDGE_STATE.subscribe(self, self.on_bridge))
+        topics.BRIDGE_STATE.subscribe(self, self.on_bridge)
         for topic, handle in (
             (topics.TRACKER_STATE, self.on_tracker),
             (topics.PROCEDURE_HOLD, self.on_hold),
             (topics.NEEDLE_POSE, self.on_pose),
             (topics.OPERATOR_COMMAND, self.on_operator),
         ):
-            self.held(topic.subscribe(self, self.while_active(handle)))
+            topic.subscribe(self, self.while_active(handle))
         self._read_sparingly(topics.PREDICTED_THREAD, self.on_prediction)
         self._read_sparingly(topics.ESTIMATED_THREAD, self.on_estimate)
         self._read_sparingly(topics.MARGINS, self.on_margins)
-        self.held(self.serve(Service.PLAN_PROCEDURE, self.on_plan))
-        self._offer(Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person"))
-        self._offer(Service.RESUME_PROCEDURE, self.resume_procedure)
-        self._offer(Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person"))
-        self._action = self.held(ProcedureAction(self, self.execute, self.abort))
+        self.serve(Service.PLAN_PROCEDURE, self.on_plan)
+        for service, execute in (
+            (Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person")),
+            (Service.RESUME_PROCEDURE, self.resume_procedure),
+            (Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person")),
+        ):
+            self.serve(service, partial(self._serve, execute))
+        self._action = ProcedureAction(self)
         # Where simulated time stands still, a goal can be cancelled all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.held(self.create_timer(PERIOD, self.while_active(self.on_timer), clock=steady))
+        self.create_timer(PERIOD, self.while_active(self.on_timer), clock=steady)
+
+    def release(self) -> None:
+        """Offer the action no more."""
+        if self._action is not None:
+            self._action.destroy()
+        self._action = None
 
     def activate(self) -> None:
         """Publish that there is no procedure, or how the last one ended."""
@@ -147,15 +149,10 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Publish the velocity command of the procedure, if one runs."""
-        try:
-            pose = reading.needle_pose(message)
-            now = self.get_clock().now().nanoseconds * 1e-9
-            reading.check_pose_age(pose.stamp, now, self.configured_settings.pose_timeout)
-        except InvalidInputError as error:
-            return self.refuse(error)
-        velocity = self._session.on_pose(
-            pose.stamp, pose.tail, pose.heading, time.monotonic(), max(0.0, now - pose.stamp)
-        )
+        pose, now = reading.needle_pose(message), self.get_clock().now().nanoseconds * 1e-9
+        reading.check_pose_age(pose.stamp, now, self.configured_settings.pose_timeout)
+        age = max(0.0, now - pose.stamp)
+        velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic(), age)
         if velocity is not None:
             self._commands.publish(packed_twist(self.get_clock().now().to_msg(), velocity))
             self._moving = bool(velocity.any())
@@ -163,44 +160,44 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
             self._setpoints.publish(packed_pose_stamped(message.header.stamp, *setpoint))
         self._publish()
 
-    def on_bridge(self, message: CoilBridgeState) -> None:
+    def on_bridge(self, message: msg.CoilBridgeState) -> None:
         """Pause where the coil bridge is disarmed or stopped; register the drift that it compensates."""
         self._session.on_bridge(message.armed, message.drift)
         if self.is_active:
             self._publish()
 
-    def on_operator(self, message: TwistStamped) -> None:
+    def on_operator(self, message: object) -> None:
         """Leave the needle to the operator, whatever is commanded."""
         self._session.pause("an operator commands the needle")
         self._publish()
 
-    def on_tracker(self, message: TrackerState) -> None:
+    def on_tracker(self, message: msg.TrackerState) -> None:
         """Register whether the needle is tracked."""
-        self._session.known.on_tracker("" if message.state == TrackerState.STATE_TRACKED else _reason(message))
+        self._session.known.on_tracker("" if message.state == message.STATE_TRACKED else _reason(message))
 
-    def on_prediction(self, message: PredictedThread) -> None:
+    def on_prediction(self, message: msg.PredictedThread) -> None:
         """Register the tension of the thread."""
         tension = float(np.max(message.tension, initial=0.0))
         if not math.isfinite(tension):
-            return self.refuse(InvalidInputError("thread/predicted.tension", tension, "finite numbers"))
+            raise InvalidInputError("thread/predicted.tension", tension, "finite numbers")
         self._session.known.on_prediction(time.monotonic(), tension, lambda: _vertices(message))
 
-    def on_estimate(self, message: EstimatedThread) -> None:
+    def on_estimate(self, message: msg.EstimatedThread) -> None:
         """Register how sure the estimate is, and which forces the model does not know of."""
-        found = {
-            reading.seconds(each.since): disturbance_text(
-                each.arc_length, each.force, (each.direction.x, each.direction.y)
+        disturbances = {
+            reading.seconds(force.since): disturbance_text(
+                force.arc_length, force.force, (force.direction.x, force.direction.y)
             )
-            for each in message.disturbances[:20]
+            for force in message.disturbances[:20]
         }
-        known = self._session.known
-        known.on_estimate(time.monotonic(), message.unmeasured_for, found, lambda: _vertices(message))
+        now, unmeasured = time.monotonic(), message.unmeasured_for
+        self._session.known.on_estimate(now, unmeasured, disturbances, lambda: _vertices(message))
 
-    def on_margins(self, message: SafetyMargins) -> None:
+    def on_margins(self, message: msg.SafetyMargins) -> None:
         """Register the thread's friction, and whether its margins are valid."""
         reason = "" if message.valid else _reason(message)
         if not reason and not 0.0 < message.slowdown <= 1.0:
-            return self.refuse(InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1"))
+            raise InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1")
         nodes, version = len(message.friction_nodes), message.scene_version
         self._session.known.on_margins(time.monotonic(), reason, nodes, message.slowdown, version)
 
@@ -223,17 +220,16 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
 
     def _read_sparingly(self, topic: topics.Topic, handle: Callable[[Any], None]) -> None:
         """Read every message of a topic while a procedure is executed, and few while none is, as that costs most."""
+        due = 0.0  # when the next message is read while nothing is executed [s]
 
         def take(data: bytes) -> None:
+            nonlocal due
             now = time.monotonic()
-            if now >= self._read_due.get(topic.name, 0.0) or self._session.is_active:
-                self._read_due[topic.name] = now + 0.2
+            if now >= due or self._session.is_active:
+                due = now + 0.2
                 topic.decoded(self, data, handle)
 
-        self.held(topic.subscribe(self, self.while_active(take), raw=True))
-
-    def _offer(self, service: Service, execute: Callable[[], bool]) -> None:
-        self.held(self.serve(service, partial(self._serve, execute)))
+        topic.subscribe(self, self.while_active(take), raw=True)
 
     def _serve(self, execute: Callable[[], bool], request: Any, answer: Any) -> Any:
         self.require_active()
@@ -248,8 +244,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
             return self._session.plan(procedure, time.monotonic(), hold_to_run=request.hold_to_run)
 
     def _check_bridge(self) -> None:
-        problem = self._graph_problem()
-        if problem:
+        if problem := self._graph_problem():
             raise InvalidInputError("needle/servo_cv", problem, "the coil bridge, and no other node that commands")
         self._session.check_armed()
 
@@ -265,8 +260,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
         if not self._session.is_commanding:
             self._rest()
         stamp = self.get_clock().now().to_msg()
-        plan = self._session.new_plan()
-        if plan is not None:
+        if (plan := self._session.new_plan()) is not None:
             self._plans.publish(packed_path(stamp, plan))
         status, now = self._session.status, time.monotonic()
         key = (status.state, status.procedure, status.goal, status.reason, status.resumes, status.hold_to_run)
@@ -275,9 +269,10 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
             message = state_message(stamp, status)
             self._states.publish(message)
             self._report(status)
-            self._action.update(message)
+            if self._action is not None:
+                self._action.update(message)
 
-    def _report(self, status: ProcedureStatus) -> None:
+    def _report(self, status: session.ProcedureStatus) -> None:
         name, state, text, level = shortened(status.procedure), status.state, "no procedure", self.health.ok
         if state is ProcedureState.RUNNING:
             text = f"{name}: {status.goals[status.goal]}, goal {status.goal + 1} of {len(status.goals)}"
@@ -310,25 +305,16 @@ def _reason(message: Any) -> str:
 
 def _vertices(message: Any) -> Points | None:
     """Return the nodes of a predicted or estimated thread, shape (n + 1, 2) [m]; None where these are no thread."""
-    found = np.array([(point.x, point.y) for point in message.positions])
-    return found if len(found) >= 2 and np.isfinite(found).all() else None
+    vertices = np.array([(point.x, point.y) for point in message.positions])
+    return vertices if len(vertices) >= 2 and np.isfinite(vertices).all() else None
 
 
-def state_message(stamp: Any, status: ProcedureStatus) -> StateMessage:
-    """Return the state of a procedure as a message."""
-    return StateMessage(
-        header=Header(stamp=stamp, frame_id=interface.DISH_FRAME),
-        state=getattr(StateMessage, f"STATE_{'IDLE' if status.state is None else status.state.name}"),
-        procedure=shortened(status.procedure),
-        goals=list(status.goals),
-        goal=status.goal,
-        goals_met=status.goals_met,
-        progress=status.progress,
-        reason=shortened(status.reason, MAX_REASON_CHARS),
-        resumes=status.resumes,
-        hold_to_run=status.hold_to_run,
-        clearance=status.clearance,
-    )
+def state_message(stamp: Any, status: session.ProcedureStatus) -> StateMessage:
+    """Return the state of a procedure as a message, whose fields have the names of its own."""
+    state = getattr(StateMessage, f"STATE_{'IDLE' if status.state is None else status.state.name}")
+    fields = {**vars(status), "state": state, "goals": list(status.goals), "procedure": shortened(status.procedure)}
+    fields["reason"] = shortened(status.reason, MAX_REASON_CHARS)
+    return StateMessage(header=Header(stamp=stamp, frame_id=interface.DISH_FRAME), **fields)
 
 
 class ProcedureAction:
@@ -336,28 +322,20 @@ class ProcedureAction:
 
     Args:
         node: that executes procedures.
-        begin: begins the procedure of a goal, or raises why it cannot.
-        abort: gives the procedure up, for a reason.
     """
 
-    def __init__(self, node: GuardedNode, begin: Callable[[Any], None], abort: Callable[[str], object]) -> None:
-        self._node, self._begin, self._abort = node, begin, abort
+    def __init__(self, node: NeedlePlannerNode) -> None:
+        self._node = node
         self._goal: Any = None
         self._end: Future = Future()  # of the goal's procedure, with its last state
-        self._server = ActionServer(
-            node,
-            ExecuteProcedure,
-            interface.EXECUTE_PROCEDURE,
-            self.on_goal,
-            goal_callback=lambda request: GoalResponse.ACCEPT,
-            cancel_callback=self.on_cancel,
-        )
-        self.destroy = self._server.destroy
+        callbacks = {"goal_callback": lambda request: GoalResponse.ACCEPT, "cancel_callback": self.on_cancel}
+        server = ActionServer(node, ExecuteProcedure, interface.EXECUTE_PROCEDURE, self.on_goal, **callbacks)
+        self.destroy = server.destroy
 
     async def on_goal(self, goal: Any) -> ExecuteProcedure.Result:
         """Begin the procedure of a goal, and return its result at its end."""
         try:
-            self._begin(goal.request)
+            self._node.execute(goal.request)
         except Exception as error:  # it would come out of `spin`
             self._node.refuse(error)
             goal.abort()
@@ -376,7 +354,7 @@ class ProcedureAction:
         """Give the procedure of a goal up."""
         if goal != self._goal or self._end.done():
             return CancelResponse.REJECT
-        self._abort("cancelled by the client of the action")
+        self._node.abort("cancelled by the client of the action")
         return CancelResponse.ACCEPT
 
     def update(self, status: StateMessage) -> None:

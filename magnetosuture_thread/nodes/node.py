@@ -39,7 +39,6 @@ from magnetosuture_thread.settings.configuration import Configuration, configura
 from magnetosuture_thread.settings.errors import GraphError, shortened
 
 C = TypeVar("C", bound=Configuration)
-E = TypeVar("E")  # a publisher, subscription, service or timer, or another part of a node with a method `destroy`
 
 PERIOD = 1.0  # s between two reports of a node
 # Keys of the coil bridge's report, which its clients read.
@@ -115,15 +114,15 @@ class Health:
                     self._node.get_logger().info(compiling)
                 self.publish()
 
-        thread = threading.Thread(target=repeat, daemon=True)
-        thread.start()
+        worker = threading.Thread(target=repeat, daemon=True)
+        worker.start()
         Health.loading += 1
         try:
             yield
         finally:
             Health.loading -= 1
             done.set()
-            thread.join()
+            worker.join()
 
     def publish(self) -> None:
         """Publish the state now."""
@@ -166,7 +165,7 @@ class Health:
 
 def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
     """Return message and values of a status, of anybody, with texts of bounded length."""
-    values = {shortened(each.key): shortened(each.value, MAX_REASON_CHARS) for each in status.values[:100]}
+    values = {shortened(pair.key): shortened(pair.value, MAX_REASON_CHARS) for pair in status.values[:100]}
     return shortened(status.message, MAX_REASON_CHARS), values
 
 
@@ -177,12 +176,14 @@ class GuardedNode(Node):
     `spin` and end the node; so would a time on /clock that rclpy cannot represent.
     """
 
+    input_errors: ClassVar[tuple[type[Exception], ...]] = (InvalidInputError,)  # of messages that are refused
+
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
         for service in self.services:  # those of rclpy itself
             service.callback = partial(_answer, self.get_logger(), service.srv_name, service.callback)
-        node = ref(self)  # where a constructor fails, nothing may keep the node: it would stay in the graph
-        self.add_on_set_parameters_callback(lambda parameters: _check_parameters(node(), parameters))
+        # A weak reference: where a constructor fails, nothing may keep the node, which would stay in the graph.
+        self.add_on_set_parameters_callback(partial(_check_parameters, ref(self)))
 
     @cached_property
     def health(self) -> Health:
@@ -219,23 +220,21 @@ class GuardedNode(Node):
     ) -> Subscription:
         """Subscribe; of /clock, to which rclpy subscribes by itself, only a possible time is passed on."""
         if msg_type is ClockMessage and not options.get("raw"):
-            node: Callable[[], Any] = ref(self)
-            options["raw"], received = True, callback
-
-            def callback(data: bytes) -> None:
-                try:
-                    message = topics.CLOCK.decode(data)
-                    reading.clock_nanoseconds(message)
-                except InvalidInputError as error:
-                    node().refuse(error)
-                else:
-                    received(message)
-
+            options["raw"], callback = True, partial(_take_clock, ref(self), callback)
         return super().create_subscription(msg_type, topic, callback, *arguments, **options)
 
 
-def _check_parameters(node: Any, parameters: list[Parameter]) -> SetParametersResult:
+def _take_clock(node: Callable[[], Any], callback: Callable[[ClockMessage], None], data: bytes) -> None:
+    def take(message: ClockMessage) -> None:
+        reading.clock_nanoseconds(message)
+        callback(message)
+
+    topics.CLOCK.decoded(node(), data, take)
+
+
+def _check_parameters(reference: Callable[[], Any], parameters: list[Parameter]) -> SetParametersResult:
     """Refuse a parameter without a name, which rclpy would declare, and another clock for a node that keeps its own."""
+    node = reference()
     reason, now = "", node.get_parameter("use_sim_time").value
     for parameter in parameters:
         if not parameter.name:
@@ -290,16 +289,11 @@ def _check_lengths(request: Any) -> None:
 def _refused(response: Any, reason: str, request: Any) -> Any:
     """Write into the default response of a service that the request has failed, where it has a field for that."""
     failed = SetParametersResult(successful=False, reason=reason)
-    fields = {
-        "success": False,
-        "message": reason,
-        "successful": False,
-        "failure_reason": reason,
-        "result": failed,
-        "results": [failed] * min(len(getattr(request, "parameters", ())), MAX_REQUEST_ENTRIES),
-    }
+    count = min(len(getattr(request, "parameters", ())), MAX_REQUEST_ENTRIES)
+    fields = {"success": False, "message": reason, "successful": False, "failure_reason": reason}
+    fields |= {"result": failed, "results": [failed] * count}
     for name, kind in response.get_fields_and_field_types().items():
-        if name in fields and (name not in ("result", "results") or "SetParametersResult" in kind):
+        if name in fields and (not name.startswith("result") or "SetParametersResult" in kind):
             setattr(response, name, fields[name])
     return response
 
@@ -309,7 +303,7 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
 
     It uses messages, answers requests and commands only while it is active: see `while_active` and `require_active`.
     What others wait for, as its publishers, enters the graph when it is configured, with everything loaded, and leaves
-    when it is cleaned up: see `held`.
+    when it is cleaned up: all that was created meanwhile.
 
     Args:
         name: of the node.
@@ -331,17 +325,15 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
 
     def __init__(self, name: str, settings: type[C], *, fixed: Mapping[str, str] | None = None, **options: Any) -> None:
         self.settings: C | None = None
-        self.is_active = False
+        self.is_active = self._starts = False
         self.problem: Exception | None = None
-        self._held: list[Any] = []
+        self._lasting: set[Any] | None = None  # what stays in the graph when the node is cleaned up
         self._agreed: tuple[C, Callable[[], None]] | None = None
-        self._starts = False
         super().__init__(name, **options)
-        self._class = settings
-        every = dict.fromkeys((each.name for each in configuration_fields(settings)), "")
-        self._fixed = every if fixed is None else fixed
+        self._class, self._names = settings, [field.name for field in configuration_fields(settings)]
+        self._fixed = dict.fromkeys(self._names, "") if fixed is None else fixed
         try:
-            declare(self, settings, options, read_only=False, fixed=self._fixed)
+            declare(self, settings, options, fixed=self._fixed)
         except ConfigurationError:
             self._leave()
             raise
@@ -360,7 +352,7 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         """Become inactive; must not fail."""
 
     def release(self) -> None:
-        """Give back what `allocate` took and is not held, also if that did not get to its end; must not fail."""
+        """Give back what `allocate` took outside of the graph, also if it did not get to its end; must not fail."""
 
     def prepare(self, settings: C) -> Callable[[], None]:
         """Return what puts other settings in force, which must not fail; raise `MagnetosutureError` if they cannot be.
@@ -368,6 +360,10 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         Only called where some parameters are not fixed.
         """
         raise NotImplementedError
+
+    def may_start(self) -> bool:
+        """Return whether the node may become active by itself at its start."""
+        return True
 
     @property
     def configured_settings(self) -> C:
@@ -394,22 +390,6 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
     def clock_is_fixed(self) -> bool:
         """Whether the node keeps the clock that it has: while it is configured."""
         return self.settings is not None
-
-    def may_start(self) -> bool:
-        """Return whether the node may become active by itself at its start."""
-        return True
-
-    def held(self, entity: E) -> E:
-        """Return an entity of this node, after noting that it leaves the graph when the node is cleaned up."""
-        self._held.append(entity)
-        return entity
-
-    def give_back(self, entity: Any) -> None:
-        """Take an entity that is held out of the graph."""
-        self._held.remove(entity)
-        destroys = (self.destroy_publisher, self.destroy_subscription, self.destroy_service, self.destroy_timer)
-        if not any(destroy(entity) for destroy in destroys):  # of which each knows its own
-            entity.destroy()
 
     def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Return a callback of a subscription or timer that is called only while the node is active."""
@@ -462,6 +442,8 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and allocate what they require."""
+        _ = self.health  # whose publisher stays
+        self._lasting = set(self._entities())
         try:
             settings = from_mapping(self._class, self._declared())
             self.allocate(settings)
@@ -470,8 +452,7 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
                 gc.freeze()
         except Exception as error:  # rclpy would swallow it, and what was taken would stay
             self._release_all()
-            self._stand_by(f"unconfigured: {error}")
-            return self._failed(error)
+            return self._failed(error, f"unconfigured: {error}")
         self.settings = settings
         self._stand_by(INACTIVE)
         return SUCCESS
@@ -482,8 +463,7 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         try:
             self.activate()
         except Exception as error:
-            self._stand_by(INACTIVE)
-            return self._failed(error)
+            return self._failed(error, INACTIVE)
         self.is_active = True
         return SUCCESS
 
@@ -508,16 +488,14 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Give all back for good."""
+        """Give all back for good; after an unexpected error, until the node is configured again."""
         try:
             self.deactivate()
         except Exception as error:
             self._failed(error)
         return self.on_cleanup(state)
 
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """After an unexpected error, release everything; the node can be configured again."""
-        return self.on_shutdown(state)
+    on_error = on_shutdown
 
     def finish(self) -> None:
         """Shut down by the lifecycle, so that everything is given back while the graph is still there."""
@@ -549,12 +527,23 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         response.success = request.transition.id == Transition.TRANSITION_CONFIGURE and self.stage == "inactive"
         return response if response.success else change(request, response)
 
+    def _entities(self) -> dict[Any, Callable[[Any], object]]:
+        """Return what the node has in the graph, and what takes each out of it."""
+        kinds: tuple[tuple[Iterator[Any], Callable[[Any], object]], ...] = (
+            (self.publishers, self.destroy_publisher),
+            (self.subscriptions, self.destroy_subscription),
+            (self.services, self.destroy_service),
+            (self.timers, self.destroy_timer),
+        )
+        return {entity: destroy for entities, destroy in kinds for entity in entities}
+
     def _release_all(self) -> None:
         try:
             self.release()
         finally:
-            for entity in tuple(self._held):
-                self.give_back(entity)
+            for entity, destroy in self._entities().items():
+                if self._lasting is not None and entity not in self._lasting:
+                    destroy(entity)
 
     def _leave(self) -> None:
         super().destroy_node()
@@ -568,10 +557,11 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
 
     def _declared(self) -> dict[str, Any]:
         """Return the values of the parameters."""
-        names = [each.name for each in configuration_fields(self._class)]
-        return {name: plain_value(self.get_parameter(name)) for name in names}
+        return {name: plain_value(self.get_parameter(name)) for name in self._names}
 
-    def _failed(self, error: Exception) -> TransitionCallbackReturn:
+    def _failed(self, error: Exception, state: str = "") -> TransitionCallbackReturn:
+        if state:
+            self._stand_by(state)
         self.problem = error
         if not self._starts:  # at its start the node ends by this error
             self.get_logger().error(reason_of(error))
@@ -583,35 +573,32 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         if self.settings is None:
             return SetParametersResult(successful=True)
         in_force = to_mapping(self.settings)
-        asked = {each.name: plain_value(each) for each in parameters if each.name in in_force}
-        asked = {name: value for name, value in asked.items() if value != in_force[name]}
+        values = {parameter.name: plain_value(parameter) for parameter in parameters}
+        changes = {name: value for name, value in values.items() if name in in_force and value != in_force[name]}
         try:
-            for name, value in asked.items():
-                where, long = f"{self._class.GROUP}.{name}", isinstance(value, list) and len(value)
+            for name, value in changes.items():
+                where, length = f"{self._class.GROUP}.{name}", len(value) if isinstance(value, list) else 0
                 if name in self._fixed:
-                    shown = value[:10] if long else value  # a million entries take long to write
+                    shown = value[:10] if length else value  # a million entries take long to write
                     raise ConfigurationError(where, shown, "its value in force, until the node is cleaned up")
-                if long > MAX_REQUEST_ENTRIES:
+                if length > MAX_REQUEST_ENTRIES:
                     expected = f"at most {MAX_REQUEST_ENTRIES} while the node runs"
-                    raise ConfigurationError(where, f"{long} entries", expected)
-            if asked:
-                settings = from_mapping(self._class, {**in_force, **asked})
+                    raise ConfigurationError(where, f"{length} entries", expected)
+            if changes:
+                settings = from_mapping(self._class, {**in_force, **changes})
                 self._agreed = settings, self.prepare(settings)
         except MagnetosutureError as error:
-            return SetParametersResult(successful=False, reason=_reason(error, asked))
+            name = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
+            reason = shortened(" ".join(str(error).split()), MAX_REASON_CHARS)
+            if name not in ("", *changes):
+                reason += "; what belongs together is set at once, by set_parameters_atomically"
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     def _put_in_force(self, parameters: Sequence[Parameter]) -> None:
         if self._agreed is not None:
             (self.settings, put_in_force), self._agreed = self._agreed, None
             put_in_force()
-
-
-def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
-    """Return why a change was refused, in one line."""
-    named = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
-    together = "" if named in ("", *asked) else "; what belongs together is set at once, by set_parameters_atomically"
-    return shortened(" ".join(str(error).split()), MAX_REASON_CHARS) + together
 
 
 class SceneFollower:

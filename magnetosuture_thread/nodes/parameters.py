@@ -63,14 +63,7 @@ def init(arguments: Sequence[str] | None = None, context: Context | None = None,
     _ARGUMENTS[context] = line
 
 
-def declare(
-    node: Node,
-    cls: type[C],
-    options: Mapping[str, Any],
-    *,
-    read_only: bool = True,
-    fixed: Mapping[str, str] | None = None,
-) -> C:
+def declare(node: Node, cls: type[C], options: Mapping[str, Any], fixed: Mapping[str, str] | None = None) -> C:
     """Declare every field of a configuration class and return the settings in force.
 
     Their values are those of the parameter files and the command line that are meant for this node, of which the later
@@ -81,9 +74,8 @@ def declare(
         node: that gets the parameters, in any namespace and under any name.
         cls: the configuration class; by its `GROUP` parameter files know the node whatever it is renamed to.
         options: as given to the node: `cli_args`, `parameter_overrides` and others of rclpy.
-        read_only: whether they stay as they are for good.
-        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; for their
-            descriptions.
+        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; if None, all stay
+            as they are for good.
 
     Raises:
         ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds, a parameter file cannot be
@@ -99,7 +91,7 @@ def declare(
         node.declare_parameter(setting.name, _type(setting), ignore_override=True)
     node.set_parameters_atomically([_parameter(setting, getattr(settings, setting.name)) for setting in fields])
     for setting in fields:
-        node.set_descriptor(setting.name, _descriptor(setting, read_only, (fixed or {}).get(setting.name)))
+        node.set_descriptor(setting.name, _descriptor(setting, fixed))
     weak = ref(node)  # where a constructor fails, nothing may keep the node: it would stay in the graph
     node.add_pre_set_parameters_callback(lambda parameters: _as_declared(weak(), cls, parameters))
     return settings
@@ -168,24 +160,21 @@ def _sections_for(path: Path, kind: str, node: str, is_required: bool) -> list[d
     return [values for key, values in sections if key in fitting]
 
 
-def _descriptor(setting: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
+def _descriptor(setting: ConfigurationField, fixed: Mapping[str, str] | None) -> ParameterDescriptor:
     quantity, constraints = setting.quantity, setting.quantity.expectation(setting.kind, entry=setting.entry)
-    if fixed is not None:
-        constraints += "; stays while the node is configured" + (f": {fixed}" if fixed else "")
+    if fixed is not None and setting.name in fixed:
+        why = fixed[setting.name]
+        constraints += "; stays while the node is configured" + (f": {why}" if why else "")
     ranges: dict[str, Any] = {}
     if setting.kind in (float, int) and math.isfinite(quantity.maximum):
         limits = {"from_value": setting.kind(quantity.minimum), "to_value": setting.kind(quantity.maximum)}
         if setting.kind is float:
-            ranges["floating_point_range"] = [FloatingPointRange(**limits)]
+            ranges = {"floating_point_range": [FloatingPointRange(**limits)]}
         else:
-            ranges["integer_range"] = [IntegerRange(**limits, step=1)]
-    return ParameterDescriptor(
-        type=_type(setting).value,
-        description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
-        additional_constraints=constraints,
-        read_only=read_only,
-        **ranges,
-    )
+            ranges = {"integer_range": [IntegerRange(**limits, step=1)]}
+    description = f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description
+    texts = {"description": description, "additional_constraints": constraints}
+    return ParameterDescriptor(type=_type(setting).value, read_only=fixed is None, **texts, **ranges)
 
 
 def _type(setting: ConfigurationField) -> Parameter.Type:

@@ -8,7 +8,7 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.duration import Duration
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
+from magnetosuture_thread import ConfigurationError, Scene
 from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
@@ -36,14 +36,14 @@ class PathFollowerNode(ManagedNode[PathFollowerSettings]):
             settings.check_path(scene)
         prepare_paths()
         self._follower, self._blocked = settings.follower(), ""
-        self._setpoints = self.held(topics.TIP_SETPOINT.publisher(self))
-        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
+        self._setpoints = topics.TIP_SETPOINT.publisher(self)
+        topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose))
         self.health.note(progress=0.0)
 
     def activate(self) -> None:
         """Begin the path, or go on with it."""
         # While it is there a needle planner refuses to command beside it.
-        self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))
+        self._commands = topics.NEEDLE_COMMAND.publisher(self)
         self.health.warn("no needle pose yet")
 
     def deactivate(self) -> None:
@@ -51,7 +51,7 @@ class PathFollowerNode(ManagedNode[PathFollowerSettings]):
         if self.is_active:
             self._command(np.zeros(2))
             self._commands.wait_for_all_acked(Duration(seconds=DELIVERY_TIMEOUT))
-            self.give_back(self._commands)
+            self.destroy_publisher(self._commands)
 
     def on_scene(self, scene: Scene) -> None:
         """Check the path against a new scene; a blocked path is not followed further."""
@@ -73,13 +73,9 @@ class PathFollowerNode(ManagedNode[PathFollowerSettings]):
             some = f"{subscribers} of {settings.audience} subscribers to velocity commands"
             self.health.warn(some if subscribers else "no subscriber to velocity commands")
             return
-        try:
-            pose = reading.needle_pose(message)
-            reading.check_pose_age(pose.stamp, self.get_clock().now().nanoseconds * 1e-9, settings.pose_timeout)
-            command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
-        except InvalidInputError as error:
-            self.refuse(error)
-            return
+        pose = reading.needle_pose(message)
+        reading.check_pose_age(pose.stamp, self.get_clock().now().nanoseconds * 1e-9, settings.pose_timeout)
+        command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
         self._command(command.velocity)
         if 0.0 < command.progress < 1.0:
             self._setpoints.publish(packed_pose_stamped(message.header.stamp, command.tip, 0.0))

@@ -19,7 +19,7 @@ from magnetosuture_thread.bags.reading import nanoseconds
 from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Participant, listen
-from magnetosuture_thread.nodes.timeline import Timeline
+from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 
@@ -46,8 +46,7 @@ class Losses:
         self.played: Counter[str] = Counter()
         self.frames_taken = 0
         self._refused: dict[str, int] = {}
-        self._poses: set[int] = set()
-        self._answered: set[int] = set()
+        self._poses, self._answered = set[int](), set[int]()
         self._numbers: dict[str, int] = {}
         self._taken: Counter[str] = Counter()
 
@@ -85,8 +84,7 @@ class Losses:
     def count_diagnostics(self, data: bytes) -> None:
         """Count a node's status on /diagnostics."""
         for status in topics.DIAGNOSTICS.decode(data).status:
-            values = {value.key: value.value for value in status.values}
-            node = status.name.split(":")[0]
+            values, node = {pair.key: pair.value for pair in status.values}, status.name.split(":")[0]
             if node == "vision_tracker":
                 self.frames_taken = max(self.frames_taken, int(values.get("frames", "0")))
             self._refused[node] = int(values.get("refused", "0"))
@@ -135,11 +133,8 @@ class LiveReplay(Participant):
         watch: Callable[[], None],
         log: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._time, self._bag_start = timeline, bag_start
-        self._nodes = nodes
-        self._receive = receive
-        self._watch = watch
-        self._log = log
+        self._time, self._bag_start, self._nodes = timeline, bag_start, nodes
+        self._receive, self._watch, self._log = receive, watch, log
         self._last_answer = time.perf_counter()
         self._still, self._last_clock = timeline.start, 0.0
         self.losses = Losses()
@@ -148,21 +143,18 @@ class LiveReplay(Participant):
         super().__init__("replay", domain=domain)
         self.node.serve(interface.Service.PAUSE_REPLAY, self._on_pause)
         self._clock = self.node.create_publisher(Clock, "/clock", qos_profile_system_default)
-        # A quality of service that waits for slow readers: only the replay has time to.
-        reliable: dict[str, Any] = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}
-        self._inputs = {
-            topic.channel.recorded: self.node.create_publisher(
-                topic.message, topic.name, QoSProfile(**reliable, durability=topic.qos.durability)
-            )
-            for topic in played
-        }
-        self._echoed = {topic.channel.recorded for topic in played if topic in topics.OUTPUTS}
+        self._inputs = {}
+        for topic in played:  # by a quality of service that waits for slow readers: only the replay has time to
+            quality = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=topic.qos.durability)
+            self._inputs[topic.channel.recorded] = self.node.create_publisher(topic.message, topic.name, quality)
+        echoed = set(played) & set(topics.OUTPUTS)
+        self._echoed = {topic.channel.recorded for topic in echoed}
         # Poses are played where no tracker runs.
-        unheard = {topics.TRACKER_STATE, topics.THREAD_OBSERVATION} if self._echoed else set()
+        unheard = {*echoed, topics.TRACKER_STATE, topics.THREAD_OBSERVATION} if echoed else set()
         self._outputs = {
             topic: listen(self.node, topic, DEPTH, partial(self._on_output, topic), reliable=True)
             for topic in topics.OUTPUTS
-            if topic.channel.recorded not in self._echoed and topic not in unheard
+            if topic not in unheard
         }
 
     def wait_for_graph(self) -> None:
@@ -177,14 +169,11 @@ class LiveReplay(Participant):
             self._take()
             self._publish_clock(self._time.start)
             time.sleep(0.02)
-            missing = [
-                name
-                for name, publisher in self._inputs.items()
-                if name not in (interface.CAMERA_INFO.recorded, interface.SCENE.recorded)
-                and not publisher.get_subscription_count()
-            ]
-            silent = (topic for topic, heard in self._outputs.items() if not heard.get_publisher_count())
-            missing += [topic.name for topic in silent if topic not in topics.ON_REQUEST]
+            unnoticed = (interface.CAMERA_INFO.recorded, interface.SCENE.recorded)
+            publishers = [pair for pair in self._inputs.items() if pair[0] not in unnoticed]
+            missing = [name for name, publisher in publishers if not publisher.get_subscription_count()]
+            heard = [pair for pair in self._outputs.items() if pair[0] not in topics.ON_REQUEST]
+            missing += [topic.name for topic, subscription in heard if not subscription.get_publisher_count()]
             if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")
             if missing:
@@ -204,8 +193,7 @@ class LiveReplay(Participant):
         self._time.begin()
         clock = last = reached = self._time.start
         for record in records:
-            publisher = self._inputs.get(record.topic)
-            if publisher is None:
+            if (publisher := self._inputs.get(record.topic)) is None:
                 continue
             if record.time - last > 1e9 * MAX_SILENCE:
                 clock = reached = self._drain(clock)  # what is under way belongs before the silence
@@ -236,12 +224,11 @@ class LiveReplay(Participant):
         self.losses.played[name] += 1
         if stamp is not None:
             self.published[name][stamp] = now
-        if record.topic == interface.SCENE.recorded:
-            self._receive(record.topic, record.time, bytes(record.data))
         if record.topic in self._echoed:
             if stamp is not None:
                 self.arrived[name].setdefault(stamp, now)
             self.losses.heard(name, stamp, None)
+        if record.topic in (interface.SCENE.recorded, *self._echoed):
             self._receive(record.topic, record.time, bytes(record.data))
 
     def _drain(self, clock: int) -> int:
@@ -280,20 +267,17 @@ class LiveReplay(Participant):
 
     def _on_output(self, topic: topics.Topic, data: bytes, info: dict[str, Any]) -> None:
         with suppress(InvalidInputError, ValueError):  # not a message of ours
-            self._count(topic, data, info)
+            is_currents = topic.channel is interface.CURRENTS  # which count by the command that they follow, if any
+            stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
+            if stamp is not None:
+                # When it reached this process: how long it waited here for its turn is not the graph's delay.
+                self.arrived[topic.channel.name].setdefault(stamp, info["received_timestamp"] * 1e-9)
+            if topic in (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS):
+                self._last_answer = time.perf_counter()
+                self.losses.heard(topic.channel.name, stamp, info["publication_sequence_number"])
+            if topic.channel is interface.DIAGNOSTICS:
+                self.losses.count_diagnostics(data)
             self._receive(topic.channel.recorded, self._time.now(), data)
-
-    def _count(self, topic: topics.Topic, data: bytes, info: dict[str, Any]) -> None:
-        is_currents = topic.channel is interface.CURRENTS  # which count by the command that they follow, if any
-        stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
-        if stamp is not None:
-            # When it reached this process: how long it waited here for its turn is not the graph's delay.
-            self.arrived[topic.channel.name].setdefault(stamp, info["received_timestamp"] * 1e-9)
-        if topic in (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS):
-            self._last_answer = time.perf_counter()
-            self.losses.heard(topic.channel.name, stamp, info["publication_sequence_number"])
-        if topic.channel is interface.DIAGNOSTICS:
-            self.losses.count_diagnostics(data)
 
     def _on_pause(self, asked: Any, answer: Any) -> Any:
         answer = self._time.on_pause(asked, answer)

@@ -18,9 +18,9 @@ from std_msgs.msg import String
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.bags.packing import camera_outputs, packed_image
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
 from magnetosuture_thread.nodes.parameters import declare
-from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Rig, RigFrame, ground_truth_outputs
@@ -63,17 +63,14 @@ class RigSimulatorNode(GuardedNode):
         self._last_index, self._clock_stamp = -1, 0
         self._frames = self._skipped = 0
         self._mark, self._factor = (0.0, 0.0), 1.0  # of the real-time factor: time and lag before, the factor since
-        # A thread of its own renders and publishes, so that currents are in force at once, as on a rig.
+        # A worker renders and publishes, so that currents are in force at once, as on a rig.
         self._renderer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="renderer")
         self._rendering: deque[Future[None]] = deque()
         self._late: deque[tuple[float, int, RigFrame]] = deque()
-        self._outputs = {
-            interface.COMPRESSED_IMAGE: topics.COMPRESSED_IMAGE.publisher(self),
-            interface.CAMERA_INFO: topics.CAMERA_INFO.publisher(self),
-            interface.GROUND_TRUTH_NEEDLE: topics.GROUND_TRUTH_NEEDLE.publisher(self),
-            interface.GROUND_TRUTH_THREAD: topics.GROUND_TRUTH_THREAD.publisher(self),
-            interface.GROUND_TRUTH_PULL: topics.GROUND_TRUTH_PULL.publisher(self),
-        }
+        self._show = topics.publishing(self, topics.COMPRESSED_IMAGE, topics.CAMERA_INFO)
+        self._reveal = topics.publishing(
+            self, topics.GROUND_TRUTH_NEEDLE, topics.GROUND_TRUTH_THREAD, topics.GROUND_TRUTH_PULL
+        )
         self._raw = topics.IMAGE.publisher(self)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
         self._scene = SceneFollower(self, self.on_scene, scene)
@@ -100,10 +97,7 @@ class RigSimulatorNode(GuardedNode):
 
     def on_fault(self, message: String) -> None:
         """Apply a fault that begins now."""
-        try:
-            self.rig.faults.add(Fault.requested(message.data, max(0.0, self.rig.running)))
-        except InvalidInputError as error:
-            self.refuse(error)
+        self.rig.faults.add(Fault.requested(message.data, max(0.0, self.rig.running)))
 
     def on_clock(self) -> None:
         """Publish the simulated time, which waits for the rig where that is late and never goes back."""
@@ -196,7 +190,7 @@ class RigSimulatorNode(GuardedNode):
         return self._factor
 
     def _render(self, elapsed: float, stamp: int, frame: RigFrame) -> None:
-        """Render a frame and publish it, in the renderer's thread; a late one is published when it is due."""
+        """Render a frame and publish it, by the renderer; a late one is published when it is due."""
         frame = self.rig.render(frame)
         if frame.lateness:
             self._late.append((elapsed + frame.lateness, stamp, frame))
@@ -205,15 +199,12 @@ class RigSimulatorNode(GuardedNode):
 
     def _publish(self, stamp: int, frame: RigFrame) -> None:
         """Publish a frame with its stamp [ns]; the ground truth is published also for a lost frame."""
-        outputs = [*ground_truth_outputs(stamp, frame)]
         if frame.image is not None:
             camera, jpeg = self.rig.camera, encode_jpeg(frame.image, self._settings.jpeg_quality)
-            distance = self._settings.camera_distance
-            outputs = [*camera_outputs(stamp, jpeg, camera.size, camera.view, distance), *outputs]
+            self._show(camera_outputs(stamp, jpeg, camera.size, camera.view, self._settings.camera_distance))
             if self._raw.get_subscription_count():
                 self._raw.publish(packed_image(stamp, frame.image))
-        for channel, data in outputs:
-            self._outputs[channel].publish(data)
+        self._reveal(ground_truth_outputs(stamp, frame))
 
     def _fail(self, error: MagnetosutureError) -> None:
         """Switch the coils off where the simulation does not find its next state, and say so."""

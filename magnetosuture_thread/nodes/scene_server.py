@@ -29,15 +29,15 @@ class SceneServerNode(ManagedNode[SceneServerSettings]):
     def allocate(self, settings: SceneServerSettings) -> None:
         """Read the scene."""
         self._editor = editor = SceneEditor(read_scene(settings.scene) if settings.scene else None)
-        self._scenes = self.held(topics.SCENE.publisher(self))
-        self._markers = self.held(topics.SCENE_MARKERS.publisher(self))
+        self._scenes = topics.SCENE.publisher(self)
+        self._markers = topics.SCENE_MARKERS.publisher(self)
         for service, change in (
             (Service.LOAD_SCENE, lambda asked: editor.load(asked.file)),
             (Service.ADD_SHAPE, lambda asked: editor.add(parse_shape_message(asked.shape))),
             (Service.REPLACE_SHAPE, lambda asked: editor.replace(parse_shape_message(asked.shape))),
             (Service.REMOVE_SHAPE, lambda asked: editor.remove(asked.name)),
         ):
-            self.held(self.serve(service, partial(self._change, change)))
+            self.serve(service, partial(self._change, change))
 
     def activate(self) -> None:
         """Publish the scene; inactive, others go on by what they have."""

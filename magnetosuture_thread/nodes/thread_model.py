@@ -72,18 +72,14 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
         with self.health.load("the model's kernels"):
             self._session = ThreadSession(settings, scene)
             self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
-        self._outputs = {
-            interface.PREDICTED_THREAD: self.held(topics.PREDICTED_THREAD.publisher(self)),
-            interface.ESTIMATED_THREAD: self.held(topics.ESTIMATED_THREAD.publisher(self)),
-            interface.MARGINS: self.held(topics.MARGINS.publisher(self)),
-        }
-        self._markers = self.held(topics.THREAD_MARKERS.publisher(self))
+        self._publish = topics.publishing(self, topics.PREDICTED_THREAD, topics.ESTIMATED_THREAD, topics.MARGINS)
+        self._markers = topics.THREAD_MARKERS.publisher(self)
         self._last_margins = 0  # stamp of those that were published [ns]
         if self._listens:
             self._subscribe()
         where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
-        thread = f"{settings.segments} segments of {settings.material}"
-        self.get_logger().info(f"ready: {thread}, {where}, {settings.formulation} by {settings.solver}")
+        model = f"{where}, {settings.formulation} by {settings.solver}"
+        self.get_logger().info(f"ready: {settings.segments} segments of {settings.material}, {model}")
 
     def listen(self) -> None:
         """Take needle poses, and what is seen of the thread, by topics from now on."""
@@ -92,10 +88,12 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
             self._subscribe()
 
     def _subscribe(self) -> None:
-        observation, measured = self.on_observation_message, self.on_measured_thread_message
-        self.held(topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True))
-        self.held(topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True))
-        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
+        for topic, take in (
+            (topics.THREAD_OBSERVATION, self.on_observation_message),
+            (topics.MEASURED_THREAD, self.on_measured_thread_message),
+        ):
+            topic.subscribe(self, self.while_active(take), raw=True)
+        topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose))
 
     def activate(self) -> None:
         """Wait for a needle pose."""
@@ -128,29 +126,30 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose, or report why that is impossible."""
-        self._step(message.header.stamp, lambda: reading.needle_pose(message))
+        self._step(message.header.stamp, reading.needle_pose(message))
 
     def on_tracked(self, stamp: Time, track: Track) -> None:
         """Handle what a tracker in the same process sees in a frame, as its messages would be."""
-        if self.is_active:
-            # Before the pose, so that the thread is estimated once, at the pose of its frame.
-            self._report_all(self._session.on_observation(reading.nanoseconds(stamp), track.observation))
-            self._step(stamp, lambda: reading.tracked_pose(stamp, track.tail, track.heading, track.covariance))
-
-    def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
-        began = time.perf_counter()
+        if not self.is_active:
+            return
+        # Before the pose, so that the thread is estimated once, at the pose of its frame.
+        self._report_all(self._session.on_observation(reading.nanoseconds(stamp), track.observation))
         try:
-            read = pose()
+            pose = reading.tracked_pose(stamp, track.tail, track.heading, track.covariance)
         except InvalidInputError as error:
             self.refuse(error)
-            return
-        result = self._session.predict(reading.nanoseconds(stamp), read)
+        else:
+            self._step(stamp, pose)
+
+    def _step(self, stamp: Time, pose: NeedlePose) -> None:
+        began = time.perf_counter()
+        result = self._session.predict(reading.nanoseconds(stamp), pose)
         step_time = time.perf_counter() - began
         self._publish_prediction(result, step_time)  # at once, as it is waited for
         result = self._session.estimate(result)
         self._report(result, step_time)
         if self._forecasts is not None:
-            self._forecasts.request(result, read)
+            self._forecasts.request(result, pose)
 
     def on_measured_thread_message(self, data: bytes) -> None:
         """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags."""
@@ -168,10 +167,7 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
         """Take a message about the thread; without an estimate most are not needed, and only their stamp is read."""
         stamp = header_stamp(data) or 0
         if self._session.estimates or self._session.needs_measured_thread(stamp):
-            try:
-                self._report_all(take(stamp, read(topic.decode(data))))
-            except InvalidInputError as error:
-                self.refuse(error)
+            topic.decoded(self, data, lambda message: self._report_all(take(stamp, read(message))))
 
     def _report_all(self, results: Iterator[PredictionResult]) -> None:
         began = time.perf_counter()
@@ -184,8 +180,7 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
             self._report(late, 0.0)
 
     def _publish_prediction(self, result: PredictionResult, step_time: float) -> None:
-        for channel, data in prediction_outputs(result, self._session.settings.material, step_time):
-            self._outputs[channel].publish(data)
+        self._publish(prediction_outputs(result, self._session.settings.material, step_time))
 
     def _report(self, result: PredictionResult, step_time: float) -> None:
         """Publish estimate and margins of a pose or of a late observation, or why there are none."""
@@ -193,9 +188,8 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
             self.refuse(result.refused)
             return
         is_newest = result.stamp >= self._last_margins or not result.late
-        for channel, data in estimate_outputs(result):
-            if channel is not interface.MARGINS or is_newest:  # margins of an earlier frame are of no use any more
-                self._outputs[channel].publish(data)
+        outputs = estimate_outputs(result)  # margins of an earlier frame are of no use any more
+        self._publish(output for output in outputs if output[0] is not interface.MARGINS or is_newest)
         if is_newest and (result.estimate is not None or not result.late):
             self._last_margins = result.stamp
             if self._markers.get_subscription_count() and (result.prediction or result.estimate):
@@ -254,44 +248,41 @@ class ThreadHealth:
 
     def _troubles(self, result: PredictionResult) -> list[str]:
         """Return what is wrong with prediction and estimate; figures in it change once a second at the most."""
-        found, prediction, estimate = [], result.prediction, result.estimate
+        troubles, prediction, estimate = [], result.prediction, result.estimate
         if prediction is not None and prediction.status not in (SOLVED, STARTED):
-            found.append(prediction.status)
+            troubles.append(prediction.status)
         if result.estimate_problem is not None:
-            found.append(f"not estimating: {result.estimate_problem}")
+            troubles.append(f"not estimating: {result.estimate_problem}")
         if estimate is None:
-            return found
+            return troubles
         if not estimate.converged:
-            found.append(result.reason)
-        if estimate.disturbances:
-            if not self._disturbance or abs(estimate.stamp - self._disturbance[0]) >= 1.0:
-                self._disturbance = (estimate.stamp, "; ".join(map(str, estimate.disturbances)))
-            found.append(self._disturbance[1])
-        else:
+            troubles.append(result.reason)
+        if not estimate.disturbances:
             self._disturbance = None
+        elif self._disturbance is None or abs(estimate.stamp - self._disturbance[0]) >= 1.0:
+            self._disturbance = (estimate.stamp, "; ".join(map(str, estimate.disturbances)))
+        if self._disturbance is not None:
+            troubles.append(self._disturbance[1])
         if estimate.unmeasured_for >= 1.0:
             why = f" ({estimate.problems[0]})" if estimate.problems else ""
-            found.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
-        return found
+            troubles.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
+        return troubles
 
     def _estimate_figures(self, estimate: ThreadEstimate) -> dict[str, object]:
         self._refused_pieces += len(estimate.problems)
-        deviation = 1e3 * float(estimate.deviation.max())
         figures: dict[str, object] = {
             "measured": f"{100.0 * (1.0 - estimate.hidden):.0f} %",
-            "deviation": f"{deviation:.3f} mm",
+            "deviation": f"{1e3 * float(estimate.deviation.max()):.3f} mm",
             "refused_pieces": self._refused_pieces,
         }
-        if estimate.problems:
-            figures["last_refused_piece"] = estimate.problems[0]
-        return figures
+        return figures | ({"last_refused_piece": estimate.problems[0]} if estimate.problems else {})
 
 
 class ThreadForecasts:
     """Publishes a forecast of every estimate, where the parameter `forecast_horizon` asks for it.
 
-    It is made in a thread of its own, so that the node does not wait for it. While a forecast is made, only the newest
-    estimate is kept for the next one. A service answers what would happen along a path instead.
+    A worker makes it, so that the node does not wait for it. While a forecast is made, only the newest estimate is kept
+    for the next one. A service answers what would happen along a path instead.
     The needle follows `procedure/plan`, or the command that the coil bridge follows, of `needle/filter_state`; without
     one it rests. See `PublishedForecasts`.
 
@@ -308,15 +299,13 @@ class ThreadForecasts:
         self._last: tuple[PredictionResult, NeedlePose] | None = None
         self._started = -math.inf  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
-        settings = session.settings
-        self._choice = PublishedForecasts(NeedleKinematics(settings.needle_length, settings.needle_curvature))
+        self._choice = PublishedForecasts(_kinematics(session.settings))
         self.problem, self._generation = "", 0  # the latter of the forecasts that are still wanted
         self._forecaster()
-        self._published = node.held(topics.FORECAST.publisher(node))
-        self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
-        node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
-        node.held(topics.PROCEDURE_PLAN.subscribe(node, self.on_plan))
-        node.held(node.serve(interface.Service.FORECAST_PATH, self.on_path))
+        self._published, self._markers = topics.FORECAST.publisher(node), topics.THREAD_MARKERS.publisher(node)
+        topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state))
+        topics.PROCEDURE_PLAN.subscribe(node, self.on_plan)
+        node.serve(interface.Service.FORECAST_PATH, self.on_path)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="forecasts")
         self._error: Exception | None = None
 
@@ -332,18 +321,12 @@ class ThreadForecasts:
 
     def on_filter_state(self, message: object) -> None:
         """Remember the command that the bridge follows."""
-        try:
-            stamp, commanded, filtered, source = reading.filtered_command(message)
-            self._choice.on_command(1e-9 * stamp, commanded, filtered, source)
-        except InvalidInputError as error:
-            self._node.refuse(error)
+        stamp, commanded, filtered, source = reading.filtered_command(message)
+        self._choice.on_command(1e-9 * stamp, commanded, filtered, source)
 
     def on_plan(self, message: object) -> None:
         """Remember where the needle planner takes the needle."""
-        try:
-            self._choice.on_plan(reading.path_poses(message, topics.PROCEDURE_PLAN.name))
-        except InvalidInputError as error:
-            self._node.refuse(error)
+        self._choice.on_plan(reading.path_poses(message, topics.PROCEDURE_PLAN.name))
 
     def request(self, result: PredictionResult, pose: NeedlePose) -> None:
         """Queue the forecast from an estimate; the worker thread makes and publishes it.
@@ -417,7 +400,7 @@ class ThreadForecasts:
         settings, scene = self._session.settings, self._session.scene
         if self._made is None or self._made[0] is not settings or self._made[1] is not scene:
             self.reset()
-            self._choice.on_needle(NeedleKinematics(settings.needle_length, settings.needle_curvature))
+            self._choice.on_needle(_kinematics(settings))
             self._made = settings, scene, None  # also where this fails: once is enough
             if scene is not None:
                 forecaster = make_forecaster(settings, scene)
@@ -427,6 +410,10 @@ class ThreadForecasts:
         return self._made[2]
 
 
+def _kinematics(settings: ThreadModelSettings) -> NeedleKinematics:
+    return NeedleKinematics(settings.needle_length, settings.needle_curvature)
+
+
 def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollower:
     """Return the controller that takes the tip along the path of a request, as the node `path_follower` does.
 
@@ -434,20 +421,16 @@ def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollo
         InvalidInputError: path, speed or horizon are out of bounds.
     """
     points = np.array([(point.x, point.y) for point in request.path]).reshape(-1, 2)
-    if not 0 < len(points) <= 1000:
-        raise InvalidInputError("path", f"{len(points)} points", "1 to 1000")
-    if not (np.abs(points) <= 0.5).all():
-        raise InvalidInputError("path", "a point that is not finite or far away", "within 0.5 m")
-    if not 1e-5 <= request.speed <= 0.1:
-        raise InvalidInputError("speed", request.speed, "1e-05 to 0.1 m/s")
-    if not 0.0 < request.horizon <= 10.0:  # s; the node does nothing else while it is computed
-        raise InvalidInputError("horizon", request.horizon, "above 0 and at most 10 s")
-    chosen = PathFollowerSettings(
-        waypoints=tuple(points.ravel().tolist()),
-        speed=request.speed,
-        settle=0.0,
-        integral_gain=0.0,  # the forecast knows all drag that there is
-        needle_length=settings.needle_length,
-        needle_curvature=settings.needle_curvature,
-    )
-    return chosen.follower()
+    for is_valid, name, value, expectation in (
+        (0 < len(points) <= 1000, "path", f"{len(points)} points", "1 to 1000"),
+        ((np.abs(points) <= 0.5).all(), "path", "a point that is not finite or far away", "within 0.5 m"),
+        (1e-5 <= request.speed <= 0.1, "speed", request.speed, "1e-05 to 0.1 m/s"),
+        # The node does nothing else while it is computed.
+        (0.0 < request.horizon <= 10.0, "horizon", request.horizon, "above 0 and at most 10 s"),
+    ):
+        if not is_valid:
+            raise InvalidInputError(name, value, expectation)
+    arc: dict[str, Any] = {"needle_length": settings.needle_length, "needle_curvature": settings.needle_curvature}
+    path: dict[str, Any] = {"waypoints": tuple(points.ravel().tolist()), "speed": request.speed, "settle": 0.0}
+    # Without the integral: the forecast knows all drag that there is.
+    return PathFollowerSettings(**path, **arc, integral_gain=0.0).follower()

@@ -6,12 +6,12 @@ every channel and tuple of channels there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -47,8 +47,9 @@ UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 
 
 class Subscriber(Protocol):
-    """A node that reports messages that are refused."""
+    """A node that reports messages that are refused, by the errors of their callbacks."""
 
+    input_errors: ClassVar[tuple[type[Exception], ...]]
     create_subscription: Callable[..., Subscription]
     refuse: Callable[[Exception], None]
 
@@ -136,13 +137,11 @@ class Topic:
         return subscription
 
     def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> None:
-        """Call back with the message of some bytes; where they are none, the node reports that they are refused."""
+        """Call back with the message of some bytes; what is none, or the callback refuses, the node reports."""
         try:
-            message = self.decode(data)
-        except InvalidInputError as error:
+            callback(self.decode(data))
+        except node.input_errors as error:
             node.refuse(error)
-        else:
-            callback(message)
 
 
 def ros_class(type_name: str) -> Any:
@@ -159,12 +158,23 @@ def topic_of(channel: Channel) -> Topic:
 
 def __getattr__(name: str) -> Any:
     """Return the topic of the channel of this name, or those of a tuple of channels."""
-    found = getattr(interface, name, None)
-    if isinstance(found, Channel):
-        return topic_of(found)
-    if isinstance(found, tuple) and isinstance(found[0], Channel):
-        return tuple(map(topic_of, found))
+    match getattr(interface, name, None):
+        case Channel() as channel:
+            return topic_of(channel)
+        case [Channel(), *_] as channels:
+            return tuple(map(topic_of, channels))
     raise AttributeError(f"{interface.__name__} has no channel {name}")
+
+
+def publishing(node: Node, *sent: Topic) -> Callable[[Iterable[tuple[Channel, bytes]]], None]:
+    """Return a function that publishes outputs, each a channel and CDR bytes, on the topics of these channels."""
+    publishers = {topic.channel: topic.publisher(node) for topic in sent}
+
+    def publish(outputs: Iterable[tuple[Channel, bytes]]) -> None:
+        for channel, data in outputs:
+            publishers[channel].publish(data)
+
+    return publish
 
 
 def lossless(depth: int) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
+from magnetosuture_thread.bags.packing import packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.settings import interface
@@ -52,18 +52,14 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         """Load the kernels, and subscribe to the camera."""
         with self.health.load("the tracker's kernels"):
             warm_up()
-        self._states = self.held(topics.TRACKER_STATE.publisher(self))
-        self._outputs = {
-            interface.NEEDLE_POSE: self.held(topics.NEEDLE_POSE.publisher(self)),
-            interface.THREAD_OBSERVATION: self.held(topics.THREAD_OBSERVATION.publisher(self)),
-            interface.MEASURED_THREAD: self.held(topics.MEASURED_THREAD.publisher(self)),
-        }
+        self._states = topics.TRACKER_STATE.publisher(self)
+        self._publish = topics.publishing(self, topics.NEEDLE_POSE, topics.THREAD_OBSERVATION, topics.MEASURED_THREAD)
         topic = topics.COMPRESSED_IMAGE if settings.image_transport == "compressed" else topics.IMAGE
-        self._camera = self.held(topic.subscribe(self, self.while_active(self.on_image))).topic_name
+        self._camera = topic.subscribe(self, self.while_active(self.on_image)).topic_name
         self._start_session(settings, self._scene.load(settings.scene))
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.held(self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=steady))
+        self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=steady)
         self.get_logger().info(f"ready: frames from {self._camera}")
 
     def activate(self) -> None:
@@ -99,14 +95,10 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
 
     def on_tip(self, message: PointStamped) -> None:
         """Take which end of the needle is its tip."""
-        try:
-            place = reading.plane_point(message, topics.NEEDLE_TIP.name)
-        except InvalidInputError as error:
-            self.refuse(error)
-        else:
-            if self._session is not None:
-                now, stamp = self.get_clock().now().nanoseconds, reading.nanoseconds(message.header.stamp)
-                self._session.point_at_tip(place, 1e-9 * (min(stamp, now) or now))
+        place = reading.plane_point(message, topics.NEEDLE_TIP.name)
+        if self._session is not None:
+            now, stamp = self.get_clock().now().nanoseconds, reading.nanoseconds(message.header.stamp)
+            self._session.point_at_tip(place, 1e-9 * (min(stamp, now) or now))
 
     def on_watch(self) -> None:
         """Report when no frame has come for too long."""
@@ -131,11 +123,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         """Track the needle in a frame; its pose is published before the thread is measured."""
         self._last_frame = time.monotonic()
         stamp, taken = message.header.stamp, 0.0
-        try:
-            reading.checked_nanoseconds(stamp, f"{self._camera}.header.stamp")
-        except InvalidInputError as error:  # nothing that is published could be stamped by it
-            self.refuse(error)
-            return
+        reading.checked_nanoseconds(stamp, f"{self._camera}.header.stamp")  # nothing could be stamped by another
         if self._session is None:
             self._states.publish(packed_tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None)))
             self.health.warn(NO_SCENE)
@@ -146,19 +134,20 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             seen = self._session.on_broken(error)
         else:
             began = time.perf_counter()
-            seen = self._session.on_image(reading.seconds(stamp), image, lambda pose: self._publish_pose(stamp, pose))
+            # A pose is published also with a heading that is unknown, which those who need it refuse.
+            seen = self._session.on_image(
+                reading.seconds(stamp),
+                image,
+                lambda pose: self._publish(pose_outputs(stamp, pose.tail, pose.heading, pose.covariance)),
+            )
             taken = time.perf_counter() - began
         track = seen.track
         if seen.tracked:
             self._publish(thread_outputs(stamp, track.observation, seen.centreline))
-        if seen.tracked and self.follower is not None:
-            self.follower(stamp, track)
+            if self.follower is not None:
+                self.follower(stamp, track)
         self._states.publish(packed_tracker_state(stamp, track, 0.0 if seen.problem else taken))
         self._report(seen, self._session)
-
-    def _publish_pose(self, stamp: Time, pose: Track) -> None:
-        """Publish a pose, also with a heading that is unknown, which those who need it refuse."""
-        self._publish(pose_outputs(stamp, pose.tail, pose.heading, pose.covariance))
 
     def _report(self, seen: FrameMeasurement, session: TrackerSession) -> None:
         """Report what was seen in a frame."""
@@ -176,7 +165,3 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             text = "; ".join(filter(None, (self._text, self._lens_problem)))
             report = self.health.ok if text == "tracking" else self.health.warn
             report(text, confidence=round(track.confidence, 3), **values)
-
-    def _publish(self, outputs: Outputs) -> None:
-        for channel, data in outputs:
-            self._outputs[channel].publish(data)

@@ -9,13 +9,9 @@ from typing import Any
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
-from magnetosuture_msgs.msg import (
-    BarrierMargin,
-    SafetyMargins,
-    ThreadForecast,
-)
+from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins, ThreadForecast
 
-from magnetosuture_thread.nodes import console_state as messages
+from magnetosuture_thread.nodes import console as messages
 from magnetosuture_thread.settings.errors import InvalidInputError
 
 STAMP = Time(sec=12)

@@ -9,8 +9,8 @@ from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.nodes import player, topics
+from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.nodes.player import LiveReplay
-from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.interface import NEEDLE_POSE
 

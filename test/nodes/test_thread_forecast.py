@@ -13,15 +13,7 @@ from geometry_msgs.msg import Point, Vector3
 from magnetosuture_msgs.msg import FilterState
 from magnetosuture_msgs.srv import ForecastPath
 
-from magnetosuture_thread import (
-    Disc,
-    ForecastStart,
-    NeedlePose,
-    NeedleSafetyFilter,
-    Scene,
-    Thread,
-    ThreadForecaster,
-)
+from magnetosuture_thread import Disc, ForecastStart, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
 from magnetosuture_thread.bags.markers import forecast_text
 from magnetosuture_thread.bags.packing import packed_forecast
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
