@@ -14,9 +14,8 @@ from typing import Any, NoReturn, Protocol
 
 from aiohttp import WSMsgType, web
 
-from magnetosuture_thread.console.access import RateCounter, same_token
 from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController
-from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.console.settings import ConsoleSettings, RateCounter, same_token
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, MagnetosutureError
 
@@ -35,6 +34,7 @@ Reply = Callable[[str, str], None]
 
 Field = tuple[type, Quantity]
 _TEXT, _SWITCH, _NUMBER = (str, Quantity("")), (bool, Quantity("")), (float, Quantity(""))
+_PAIR = (tuple, Quantity("", multiple=2))
 
 
 def _one_of(*choices: str) -> Field:
@@ -46,11 +46,7 @@ def _one_of(*choices: str) -> Field:
 # `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is the receipt of a state or frame.
 FIELDS: dict[str, dict[str, Field]] = {
     "hello": {"token": _TEXT, "automated": _SWITCH},
-    "jog": {
-        "speed": (float, Quantity("", "m/s", minimum=0.0)),
-        "direction": (tuple, Quantity("", multiple=2)),
-        "sent": _NUMBER,
-    },
+    "jog": {"speed": (float, Quantity("", "m/s", minimum=0.0)), "direction": _PAIR, "sent": _NUMBER},
     "end_jog": {},
     "acknowledge": {"kind": _one_of("state", "frame")},
     "visibility": {"visible": _SWITCH},
@@ -102,7 +98,7 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     kind = fields.pop("type", None)
     if not isinstance(kind, str) or kind not in FIELDS:
         raise _refusal("type", kind, f"one of {', '.join(FIELDS)}")
-    values = {name: _checked(name, fields.get(name), *about) for name, about in FIELDS[kind].items()}
+    values = {name: _checked(name, fields.get(name), *field) for name, field in FIELDS[kind].items()}
     for name in values.keys() & {"direction", "position"}:
         if len(values[name]) != 2:
             raise _refusal(name, list(values[name]), "a list of two numbers")
@@ -115,11 +111,11 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     return ClientMessage(kind, values)
 
 
-def _checked(name: str, value: Any, kind: type, about: Quantity) -> Any:
+def _checked(name: str, value: Any, kind: type, quantity: Quantity) -> Any:
     if name == "automated" and value is None:
         return None
     try:
-        return about.checked(name, value, kind)
+        return quantity.checked(name, value, kind)
     except ConfigurationError as error:
         raise _refusal(name, value, error.expectation) from None
 
@@ -318,11 +314,23 @@ class RequestHandler:
         graph: the running graph.
         host: of the graph.
         jog: knows which page has control.
+
+    Attributes:
+        jog: as given.
+        hold: called while a page is held for a procedure.
     """
 
     def __init__(self, graph: Graph, host: Host, jog: JogController) -> None:
-        self._graph, self._host, self._jog = graph, host, jog
+        self.jog, self.hold = jog, graph.publish_hold
         self._pending: dict[asyncio.Task[None], int] = {}
+        self._calls: dict[str, Callable[..., Awaitable[str]]] = {  # with the fields of the message
+            "bridge_action": graph.execute_action,
+            "tip": graph.point_at_tip,
+            "procedure": graph.execute_procedure,
+            "select_setup": host.select_setup,
+            "pause": host.set_paused,
+            "record": host.set_recording,
+        }
 
     def start(self, client: int, message: ClientMessage, operator: str, reply: Reply) -> None:
         """Start a request of a page with the token.
@@ -337,45 +345,31 @@ class RequestHandler:
             InvalidInputError: the request needs control, or too many are pending.
         """
         name, unleased = message.request, message.request in UNLEASED
-        if not unleased and client != self._jog.holder:
+        if not unleased and client != self.jog.holder:
             raise InvalidInputError(name, "a page without control", "one with control: take control first")
         if not unleased and list(self._pending.values()).count(client) >= MAX_PENDING_REQUESTS:
             raise InvalidInputError(name, f"{MAX_PENDING_REQUESTS} pending requests", "a reply to one of them first")
         if name not in ("record", "arm"):  # which end no jog
-            self._jog.stop()
+            self.jog.stop()
         task = asyncio.create_task(self._execute(message, operator, reply))
         self._pending[task] = client
         task.add_done_callback(lambda done: self._pending.pop(done, None))
 
     async def close(self) -> None:
         """Cancel pending requests."""
-        tasks = list(self._pending)
-        for task in tasks:
+        for task in (tasks := list(self._pending)):
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _execute(self, message: ClientMessage, operator: str, reply: Reply) -> None:
         try:
-            refusal = await self._request(message, operator)
+            if message.type not in self._calls:
+                raise InvalidInputError("message", message.type, "a request")
+            others = {"operator": operator} if message.type == "record" else {}
+            refusal = await self._calls[message.type](**message.values, **others)
         except MagnetosutureError as error:
             refusal = str(error)
         reply(message.request, refusal)
-
-    def _request(self, message: ClientMessage, operator: str) -> Awaitable[str]:
-        values = message.values
-        if message.type == "bridge_action":
-            return self._graph.execute_action(values["action"])
-        if message.type == "tip":
-            return self._graph.point_at_tip(values["position"])
-        if message.type == "procedure":
-            return self._graph.execute_procedure(values["action"], values["procedure"], values["hold_to_run"])
-        if message.type == "select_setup":
-            return self._host.select_setup(values["setup"])
-        if message.type == "pause":
-            return self._host.set_paused(values["paused"])
-        if message.type == "record":
-            return self._host.set_recording(values["recording"], operator)
-        raise InvalidInputError("message", message.type, "a request")
 
 
 class Client:
@@ -387,9 +381,7 @@ class Client:
         request: of the connection.
         settings: of the console.
         token: that permits commands.
-        jog: control lease and jog commands.
-        requests: handler of all other requests.
-        hold: called while the page is held for a procedure.
+        requests: handler of all requests but jogs; its `jog` has the control lease and the jog commands.
 
     Attributes:
         address: of the page's computer.
@@ -404,14 +396,12 @@ class Client:
         request: web.BaseRequest,
         settings: ConsoleSettings,
         token: str,
-        jog: JogController,
         requests: RequestHandler,
-        hold: Callable[[], None],
     ) -> None:
         self.number, self.address, self.has_token = number, request.remote or "", False
         self.is_script, self._can_command = True, False
         self._socket, self._request, self._settings, self._token = socket, request, settings, token
-        self._jog, self._requests, self._hold = jog, requests, hold
+        self._jog, self._requests = requests.jog, requests
         self._outbox, self._wake = Outbox(), asyncio.Event()
         self._delay, self._last_in_time = DelayEstimator(), 0.0  # arrival of the last message that was not late
         self._rate, self._message_count, self._excess = RateCounter(), 0, 0
@@ -512,28 +502,29 @@ class Client:
             self._reply("error", text=str(InvalidInputError("token", "none", expected)))
 
     async def _dispatch(self, message: ClientMessage, now: float) -> None:
-        values = message.values
-        if message.type == "jog":
-            if not self._in_time(values["sent"], now):
-                self._jog.interrupt(self.number)
+        values, jog = message.values, self._jog
+        match message.type:
+            case "jog" if not self._in_time(values["sent"], now):
+                jog.interrupt(self.number)
                 if now - self._last_in_time > 1.0:  # s; it must reconnect
                     await self._socket.close(code=1008, message=b"all messages are late")
-            elif not self._jog.jog(self.number, values["velocity"]):
-                self._reply("error", text="jog: this page does not have control; take control first")
-        elif message.type == "hold":
-            if self._in_time(values["sent"], now) and self._jog.holder == self.number:
-                self._hold()
-        elif message.type == "end_jog":
-            self._jog.end_jog(self.number)
-        elif message.type == "acquire_control":
-            self._report(message.type, self._jog.acquire_control(self.number))
-        elif message.type == "release_control":
-            self._jog.release_control(self.number)
-        elif message.type == "visibility":
-            self._jog.set_visible(self.number, values["visible"])
-        elif message.type != "hello":
-            operator = "a script" if self.is_script else "an operator"
-            self._requests.start(self.number, message, operator, self._report)
+            case "jog":
+                if not jog.jog(self.number, values["velocity"]):
+                    self._reply("error", text="jog: this page does not have control; take control first")
+            case "hold":
+                if self._in_time(values["sent"], now) and jog.holder == self.number:
+                    self._requests.hold()
+            case "end_jog":
+                jog.end_jog(self.number)
+            case "acquire_control":
+                self._report(message.type, jog.acquire_control(self.number))
+            case "release_control":
+                jog.release_control(self.number)
+            case "visibility":
+                jog.set_visible(self.number, values["visible"])
+            case request if request != "hello":
+                operator = "a script" if self.is_script else "an operator"
+                self._requests.start(self.number, message, operator, self._report)
 
     def _in_time(self, sent: float, now: float) -> bool:
         """Return whether a message of a hold is not late; report it else."""

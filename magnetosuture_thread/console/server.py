@@ -15,10 +15,19 @@ from weakref import WeakSet
 
 from aiohttp import web
 
-from magnetosuture_thread.console import access
 from magnetosuture_thread.console.client import Client, Graph, Host, RequestHandler, encode_frame, encode_state
 from magnetosuture_thread.console.jog_controller import JogController
-from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.console.settings import (
+    ConsoleSettings,
+    RateCounter,
+    host_refusal,
+    is_any,
+    new_token,
+    origin_refusal,
+    page_url,
+    same_token,
+    server_origin,
+)
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 MAX_CLIENTS = 16  # with the token
@@ -26,6 +35,7 @@ MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they
 MAX_NEW_WATCHERS = 20  # from one address in a second
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
 
+Responder = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -49,12 +59,12 @@ class ConsoleServer:
 
     def __init__(self, settings: ConsoleSettings, graph: Graph, host: Host) -> None:
         self._settings, self._graph, self._host = settings, graph, host
-        self._token = settings.token or access.new_token()
+        self._token = settings.token or new_token()
         self._files = page_files()
         self._jog = JogController(graph.publish_velocity, settings.rate, settings.hold_timeout)
         self._requests = RequestHandler(graph, host, self._jog)
         self._clients: dict[int, Client] = {}
-        self._new_watchers, self._request_rate = access.RateCounter(), access.RateCounter()
+        self._new_watchers, self._request_rate = RateCounter(), RateCounter()
         self._count = self._port = 0
         self._scheme = "https" if settings.certificate else "http"
         self._frame_number, self._frame = -1, b""
@@ -84,8 +94,8 @@ class ConsoleServer:
         # Excludes loaded objects from garbage collection, which would take tens of milliseconds each time.
         gc.collect()
         gc.freeze()
-        own = access.server_origin("127.0.0.1" if access.is_any(address) else address, self._port, self._scheme)
-        return access.page_url(self._settings.origin or own, self._token)
+        own = server_origin("127.0.0.1" if is_any(address) else address, self._port, self._scheme)
+        return page_url(self._settings.origin or own, self._token)
 
     async def stop(self) -> None:
         """Stop the needle, then close all connections; raise the error that ended the broadcast, if any."""
@@ -107,12 +117,12 @@ class ConsoleServer:
             task.result()
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
-        if not access.same_token(request.query.get("token"), self._token):
+        if not same_token(request.query.get("token"), self._token):
             now = asyncio.get_running_loop().time()
             if self._request_rate.count(request.remote or "", now) > 100:  # those beyond wait for the next second
                 await asyncio.sleep(1.0 - now % 1.0)
         settings, host = self._settings, request.headers.get("Host", "")
-        refusal = access.host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
+        refusal = host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
         if refusal:
             return _answer(403, refusal)
         if request.method not in ("GET", "HEAD"):
@@ -129,21 +139,19 @@ class ConsoleServer:
 
     async def _connect(self, request: web.BaseRequest) -> web.StreamResponse:
         origin, host = (request.headers.get(name, "") for name in ("Origin", "Host"))
-        refusal = access.origin_refusal(origin, host, scheme=self._scheme, allowed=self._settings.origin)
-        if refusal:
+        if refusal := origin_refusal(origin, host, scheme=self._scheme, allowed=self._settings.origin):
             return _answer(403, refusal)
         # Only for a place: commands need the token of the greeting.
-        has_token = access.same_token(request.query.get("token"), self._token)
-        full = self._no_place(has_token, request.remote or "")
-        if full:
+        has_token = same_token(request.query.get("token"), self._token)
+        if full := self._no_place(has_token, request.remote or ""):
             return _answer(503, full)
         # Pings are left to the client, which counts them.
         socket = web.WebSocketResponse(compress=False, autoping=False, heartbeat=HEARTBEAT_PERIOD, max_msg_size=1 << 16)
         socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
-        shared = self._settings, self._token, self._jog, self._requests, self._graph.publish_hold
-        client = self._clients[number] = Client(number, socket, request, *shared)
+        client = Client(number, socket, request, self._settings, self._token, self._requests)
+        self._clients[number] = client
         client.has_token = has_token
         if self._frame:
             client.send_latest("frame", self._frame)
@@ -185,14 +193,11 @@ class ConsoleServer:
             client.send_latest(kind, message)
 
     def _state(self) -> str:
-        lease = {
-            "holder": self._jog.holder,
-            "available": self._jog.available,
-            "release_first": self._jog.switch.latched,
-            "pages": len(self._clients),
-        }
+        jog = self._jog
+        lease = {"holder": jog.holder, "available": jog.available, "release_first": jog.switch.latched}
+        lease["pages"] = len(self._clients)
         graph = self._graph.state()
-        self._jog.set_armed(bool((graph.get("bridge") or {}).get("armed")))
+        jog.set_armed(bool((graph.get("bridge") or {}).get("armed")))
         return encode_state(graph, self._host.state(), lease)
 
 
@@ -243,11 +248,11 @@ class _Connection(web.RequestHandler):
         super().connection_made(transport)
 
     def handle_error(
-        self, request: web.BaseRequest, status: int = 500, *given: Any, **named: Any
+        self, request: web.BaseRequest, status: int = 500, *arguments: Any, **options: Any
     ) -> web.StreamResponse:
         """Return the response to a request that cannot be handled; it closes the connection."""
         malformed = _answer(status, "malformed request") if status < 500 else None
-        response = malformed or super().handle_error(request, status, *given, **named)
+        response = malformed or super().handle_error(request, status, *arguments, **options)
         response.headers.update(HEADERS)
         response.force_close()
         return response
@@ -256,11 +261,7 @@ class _Connection(web.RequestHandler):
 class _Server(web.Server):
     """Makes such connections; `transports` holds those that are not closed."""
 
-    def __init__(
-        self,
-        respond: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]],
-        transports: WeakSet[asyncio.Transport],
-    ) -> None:
+    def __init__(self, respond: Responder, transports: WeakSet[asyncio.Transport]) -> None:
         super().__init__(respond)
         self.transports = transports
 
@@ -272,8 +273,8 @@ def page_files() -> dict[str, tuple[str, bytes]]:
     """Return MIME type and content of the page's files by the path of their URL; `/` is the page itself."""
     types = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
     entries = [Path(str(entry)) for entry in files("magnetosuture_thread.console").joinpath("page").iterdir()]
-    found = {f"/{path.name}": (types[path.suffix], path.read_bytes()) for path in entries if path.suffix in types}
-    return {"/": found.pop("/index.html"), **found}
+    served = {f"/{path.name}": (types[path.suffix], path.read_bytes()) for path in entries if path.suffix in types}
+    return {"/": served.pop("/index.html"), **served}
 
 
 def server_context(settings: ConsoleSettings) -> ssl.SSLContext | None:

@@ -29,6 +29,8 @@ from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode
 from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
 
+AGED = (*INPUTS.values(), topics.NEEDLE_POSE.name)  # inputs whose least age is reported
+
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     """Drives the coils by filtered velocity commands while active and armed, and with zeros otherwise.
@@ -48,11 +50,10 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._kept = self.system.latch.latched_reason  # from the process before, until a reset
         self._stamps: dict[str, Any] = {}  # of the last valid command of each input
         self._reactivate = False  # whether a reset activates the node again
+        self._refused, self._last_log = 0, ""
+        self._last_state: object = None
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._refused = 0
-        self._last_state: object = None
-        self._last_log = ""
         self._currents, self._setpoints = topics.CURRENTS.publisher(self), topics.NEEDLE_SETPOINT.publisher(self)
         self._states, self._filter = topics.BRIDGE_STATE.publisher(self), topics.FILTER_STATE.publisher(self)
         self._rig = topics.RIG_CURRENTS.publisher(self)
@@ -63,8 +64,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._scene = SceneFollower(self, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
-            topic.subscribe_numbered(self, partial(self.on_command, source))
-        self.serve(Service.ARM, lambda asked, answer: _done(answer, self.arm(asked.data)))
+            topic.subscribe_numbered(self, partial(self.on_command, source), self._step)
+        self.serve(Service.ARM, lambda request, answer: _done(answer, self.arm(request.data)))
         self.serve(Service.EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
         self.serve(Service.RESET, lambda _, answer: _done(answer, self.reset()))
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
@@ -152,18 +153,12 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._step()
 
     def on_command(self, source: str, message: TwistStamped, number: int) -> None:
-        """Register a velocity command of an input, and follow it at once."""
-        if self.system.bridge is None:
-            return
-        try:
+        """Register a velocity command of an input, which the next step follows."""
+        if self.system.bridge is not None:
             velocity = reading.plane_velocity(message, INPUTS[source])
             stamp = reading.checked_nanoseconds(message.header.stamp, f"{INPUTS[source]}.header.stamp") * 1e-9
             self.system.bridge.command(source, velocity, stamp, number, *self._times())
-        except self.input_errors as error:
-            self.refuse(error)
-        else:
             self._stamps[source] = message.header.stamp
-            self._step()
 
     def on_watchdog(self) -> None:
         """Apply the currents of the last valid command and pose."""
@@ -241,27 +236,28 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._last_state = now
         if output is not None and not output.publish:
             self._filter.publish(packing.packed_filter_state(stamp, output))
-        aged = (*INPUTS.values(), topics.NEEDLE_POSE.name)
         # Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
         ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
         self.health.note(
             **{key: round(value, 3) for key, value in zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)},
-            **{f"minimum age of {topic} [ms]": round(1e3 * ages.get(topic, math.nan), 1) for topic in aged},
-            driver=system.driver_name,
-            scene=scene or "none",
-            **{"driver problem": driver.problem or "none"},
+            **{f"minimum age of {name} [ms]": round(1e3 * ages.get(name, math.nan), 1) for name in AGED},
+            **{"driver": system.driver_name, "scene": scene or "none", "driver problem": driver.problem or "none"},
         )
         self._log(closed or latch.state.value, driver)
-        level, text = self.health.ok, closed or latch.stop_reason or "following commands"
         if latch.latched_reason:
-            level, text = self.health.error, self._fault()
-        elif not closed and not driver.ready:
-            level, text = self.health.warn, f"{latch.stop_reason or 'armed'}; driver: {driver.problem}"
-        elif not closed and not latch.stop_reason and (reasons or driver.warnings):
-            stopped = f"stopped: {'; '.join(reasons)}"
-            level = self.health.warn
-            text = stopped if reasons else f"following commands; driver: {'; '.join(driver.warnings)}"
-        level(text)
+            self.health.error(self._fault())
+        elif closed:
+            self.health.ok(closed)
+        elif not driver.ready:
+            self.health.warn(f"{latch.stop_reason or 'armed'}; driver: {driver.problem}")
+        elif latch.stop_reason:
+            self.health.ok(latch.stop_reason)
+        elif reasons:
+            self.health.warn(f"stopped: {'; '.join(reasons)}")
+        elif driver.warnings:
+            self.health.warn(f"following commands; driver: {'; '.join(driver.warnings)}")
+        else:
+            self.health.ok("following commands")
 
     def _fault(self) -> str:
         """Return what is latched, and the way out of what has stayed so over a restart."""

@@ -116,11 +116,18 @@ class Topic:
             self.message, self.name, take, copy(self.qos), qos_overriding_options=options, raw=True
         )
 
-    def subscribe_numbered(self, node: Subscriber, callback: Callable[[Any, int], None]) -> Subscription:
+    def subscribe_numbered(
+        self, node: Subscriber, callback: Callable[[Any, int], None], then: Callable[[], None] = lambda: None
+    ) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
 
         Where the middleware does not number messages, all that tells is how many publishers there are: of
         one, the messages are numbered here; of several, so that each message seems to be of another.
+
+        Args:
+            node: that subscribes; it reports messages that are refused.
+            callback: called with each message that can be decoded, and its number.
+            then: called after a message that was not refused; its errors are no refusals.
         """
         taken = 0
 
@@ -131,17 +138,20 @@ class Topic:
             if number is None or number == UNNUMBERED:
                 gap = 1 if subscription.get_publisher_count() <= 1 else 10_000  # so far apart are those of several
                 number = taken * gap
-            self.decoded(node, data, lambda message: callback(message, number))
+            if self.decoded(node, data, lambda message: callback(message, number)):
+                then()
 
         subscription = self.subscribe(node, take, raw=True)
         return subscription
 
-    def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> None:
-        """Call back with the message of some bytes; what is none, or the callback refuses, the node reports."""
+    def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> bool:
+        """Call back with the message of some bytes; return whether the callback did not refuse it, else report that."""
         try:
             callback(self.decode(data))
         except node.input_errors as error:
             node.refuse(error)
+            return False
+        return True
 
 
 def ros_class(type_name: str) -> Any:

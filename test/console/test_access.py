@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from magnetosuture_thread.console.access import (
+from magnetosuture_thread.console.client import MAX_UNACKNOWLEDGED, Outbox
+from magnetosuture_thread.console.settings import (
+    ConsoleSettings,
     host_refusal,
     is_loopback,
     new_token,
@@ -13,8 +15,6 @@ from magnetosuture_thread.console.access import (
     same_token,
     server_origin,
 )
-from magnetosuture_thread.console.client import MAX_UNACKNOWLEDGED, Outbox
-from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 TOKEN = "a-token-of-the-tests"
