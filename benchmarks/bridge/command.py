@@ -305,7 +305,7 @@ def measure_bridge(
                 log(f"{trials} times a commander that falls silent")
                 add("last command", bench.stop_trials(trials), settings.command_timeout + 1.0 / settings.rate)
                 with CoilClient() as client:
-                    loop, scheduling = client.loop_timing()
+                    loop, scheduling = loop_timing(client)
                 bench.start("commander")
                 for victim in PARTS:
                     log(f"{kills} times kill -9 of the {victim}")
@@ -319,6 +319,28 @@ def measure_bridge(
         **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "hostile": hostile},
         **{"greatest_current": greatest, "max_current": settings.max_current},
     }
+
+
+def loop_timing(client: CoilClient) -> tuple[list[float], str]:
+    """Return the jitter of the bridge's loop (median, 99th percentile, maximum) [ms], and how its process is scheduled.
+
+    Raises:
+        GraphError: no diagnostics were received.
+    """
+    from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.clients import Inbox
+    from magnetosuture_thread.nodes.coil_bridge import JITTER_KEYS, SCHEDULING
+    from magnetosuture_thread.nodes.node import read_status
+
+    reports = Inbox(client.node, topics.DIAGNOSTICS, 10)
+
+    def read() -> dict[str, str] | None:
+        statuses = (status for report, _ in reports.read() for status in report.status)
+        bridges = (read_status(status)[1] for status in statuses if status.name.startswith("coil_bridge:"))
+        return next((values for values in bridges if SCHEDULING in values), None)
+
+    values = client.wait_for(read, "no coil_bridge diagnostics received")
+    return [float(values[name]) for name in JITTER_KEYS], values[SCHEDULING]
 
 
 @contextmanager

@@ -35,7 +35,7 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reading import constant_name
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
-from magnetosuture_thread.nodes.node import JITTER_KEYS, MAX_REASON_CHARS, SCHEDULING, GuardedNode, read_status
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, read_status
 from magnetosuture_thread.settings.errors import GraphError, shortened
 from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, Service
 
@@ -267,8 +267,6 @@ class CoilClient(Participant):
         kinds: dict[str, str] = {service: service.type_name for service, _ in ACTIONS.values()}
         self._services = Services(self.node, {**kinds, CHANGE_STATE: "lifecycle_msgs/srv/ChangeState"})
         self._state = Latest(self.node, topics.BRIDGE_STATE)
-        self._reports = Inbox(self.node, topics.DIAGNOSTICS, 10)
-        self._bridge = f"{self.node.get_namespace()}/coil_bridge".lstrip("/")
 
     def execute(self, action: str) -> str:
         """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
@@ -317,30 +315,12 @@ class CoilClient(Participant):
             "messages refused": str(state.refused),
         }
 
-    def loop_timing(self) -> tuple[tuple[float, float, float], str]:
-        """Return the jitter of the bridge's loop, and how its process is scheduled.
-
-        Returns:
-            Median, 99th percentile and maximum over the last intervals [ms]; scheduling as text.
-
-        Raises:
-            GraphError: no diagnostics were received.
-        """
-        values = self._wait_for(self._timing_values, "no coil_bridge diagnostics received")
-        median, p99, maximum = (float(values[name]) for name in JITTER_KEYS)
-        return (median, p99, maximum), values[SCHEDULING]
-
-    def _timing_values(self) -> dict[str, str] | None:
-        statuses = (status for report, _ in self._reports.read() for status in report.status)
-        ours = (read_status(status)[1] for status in statuses if status.name.startswith(f"{self._bridge}:"))
-        return next((values for values in ours if SCHEDULING in values), None)
-
     def _wait_for_state(self) -> CoilBridgeState:
         def latest() -> Any:
             self._state.poll()
             return self._state.value
 
-        return self._wait_for(latest, "no coil_bridge state received on this ROS domain")
+        return self.wait_for(latest, "no coil_bridge state received on this ROS domain")
 
     def _call(self, name: str, request: Any, **options: Any) -> Any:
         try:
@@ -350,8 +330,12 @@ class CoilClient(Participant):
                 raise
             raise GraphError(f"no coil_bridge on this ROS domain: {error}") from None
 
-    def _wait_for(self, read: Callable[[], Any], problem: str) -> Any:
-        """Return what a function returns, once that is not None; raise `GraphError` if that takes too long."""
+    def wait_for(self, read: Callable[[], Any], problem: str) -> Any:
+        """Return what a function returns, once that is not None.
+
+        Raises:
+            GraphError: that takes too long; with the problem.
+        """
         deadline = time.monotonic() + TIMEOUT
         while True:
             self.spin_some()

@@ -14,7 +14,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
@@ -25,10 +24,13 @@ from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode, SceneFollower
+from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
 
+# Keys of the report on /diagnostics.
+SCHEDULING = "scheduling"
+JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
 AGED = (*INPUTS.values(), topics.NEEDLE_POSE.name)  # inputs whose least age is reported
 
 
@@ -52,12 +54,10 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._reactivate = False  # whether a reset activates the node again
         self._refused, self._last_log = 0, ""
         self._last_state: object = None
-        # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._currents, self._setpoints = topics.CURRENTS.publisher(self), topics.NEEDLE_SETPOINT.publisher(self)
         self._states, self._filter = topics.BRIDGE_STATE.publisher(self), topics.FILTER_STATE.publisher(self)
         self._rig = topics.RIG_CURRENTS.publisher(self)
-        self.create_timer(0.1, lambda: self._publish_state(force=True), clock=self._steady)
+        self.every(0.1, lambda: self._publish_state(force=True))
         # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
         self._log(self.system.closed, self.system.driver_state)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
@@ -80,7 +80,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
         driver = make_driver(settings, len(bridge.coils), self._send_to_rig, self._count_rigs)
         self.system.open(settings, bridge, driver)
-        self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
+        self.every(1.0 / settings.rate, self.on_watchdog)  # also while simulated time stands still
 
     def activate(self) -> None:
         """Activate, so that the bridge can be armed."""
@@ -288,9 +288,8 @@ def _done(answer: Any, problem: str) -> Any:
 
 def stop_record(node: Node) -> StopRecord:
     """Return the record of a bridge: by its parameter, or else by the names of node and graph, one for each robot."""
-    given = str(node.get_parameter_or("stop_file").value or "")
-    if given:
-        return StopRecord(Path(os.path.expanduser(given)))
+    if name := str(node.get_parameter_or("stop_file").value or ""):
+        return StopRecord(Path(os.path.expanduser(name)))
     home = os.environ.get("XDG_STATE_HOME", "")
     state = Path(home if os.path.isabs(home) else os.path.expanduser("~/.local/state"))
     name = node.get_fully_qualified_name().strip("/").replace("/", ".")

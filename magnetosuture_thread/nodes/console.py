@@ -387,8 +387,8 @@ def predicted(message: msg.PredictedThread) -> dict[str, Any]:
     """
     tension = list(message.tension)
     if tension and len(tension) + 1 != len(message.positions):
-        found = f"{len(message.positions)} positions and {len(tension)} tensions"
-        raise InvalidInputError("thread/predicted", found, "a tension for each segment, or none")
+        content = f"{len(message.positions)} positions and {len(tension)} tensions"
+        raise InvalidInputError("thread/predicted", content, "a tension for each segment, or none")
     return {
         "tension": tension,
         "needle_force": [message.needle_force.x, message.needle_force.y] if tension else None,
@@ -405,8 +405,8 @@ def estimated(message: msg.EstimatedThread) -> dict[str, Any]:
         InvalidInputError: the deviations are not those of the vertices.
     """
     if len(message.deviation) != len(message.positions):
-        found = f"{len(message.positions)} positions and {len(message.deviation)} deviations"
-        raise InvalidInputError("thread/estimated", found, "a deviation for each position")
+        content = f"{len(message.positions)} positions and {len(message.deviation)} deviations"
+        raise InvalidInputError("thread/estimated", content, "a deviation for each position")
     return {
         "vertices": _points(message.positions),
         "deviation": list(message.deviation),
@@ -430,8 +430,8 @@ def forecast(message: msg.ThreadForecast) -> dict[str, Any]:
     """
     instants, count = len(message.time), len(message.positions)
     if not instants or count % instants or count // instants > MAX_THREAD_NODES:
-        found = f"{count} positions and {instants} instants"
-        raise InvalidInputError("thread/forecast", found, "as many positions at each instant")
+        content = f"{count} positions and {instants} instants"
+        raise InvalidInputError("thread/forecast", content, "as many positions at each instant")
     nodes = count // instants
     shown = sorted({round(index) for index in np.linspace(0, instants - 1, 4)[1:]})
     vertices = {at: _points(message.positions[at * nodes : (at + 1) * nodes]) for at in shown}

@@ -91,7 +91,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
                 add(entity.handle)
         now = time.monotonic()
         with_events = now >= self._events_due
-        waitables = [each for each in self._waitables if with_events or not isinstance(each, EventHandler)]
+        waitables = [waitable for waitable in self._waitables if with_events or not isinstance(waitable, EventHandler)]
         for waitable in waitables:
             waitable.add_to_wait_set(self._wait_set)
         self._events_due = now + EVENT_PERIOD if with_events else self._events_due
@@ -113,15 +113,15 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         self._held.enter_context(self._context.handle)
         nodes = self.get_nodes()
         entities = {
-            "guard_condition": [self._guard, self._sigint_gc, *(each for node in nodes for each in node.guards)]
+            "guard_condition": [self._guard, self._sigint_gc, *(guard for node in nodes for guard in node.guards)]
         }
         for kind in ("timer", "subscription", "client", "service"):
-            entities[kind] = [each for node in nodes for each in getattr(node, f"{kind}s")]
+            entities[kind] = [entity for node in nodes for entity in getattr(node, f"{kind}s")]
         self._entities = {
-            kind: {each.handle.pointer: each for each in every if self._hold(each.handle)}
+            kind: {entity.handle.pointer: entity for entity in every if self._hold(entity.handle)}
             for kind, every in entities.items()
         }
-        self._waitables = [each for node in nodes for each in node.waitables if self._hold(each)]
+        self._waitables = [waitable for node in nodes for waitable in node.waitables if self._hold(waitable)]
         guards, timers, subscriptions, clients, services = map(len, self._entities.values())
         count = NumberOfEntities(subscriptions, guards, timers, clients, services)
         for waitable in self._waitables:
@@ -173,7 +173,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
                     raise error
         finally:
             with self._tasks_lock:
-                self._tasks[:] = [each for each in self._tasks if not (each[0].done() or each[0].cancelled())]
+                self._tasks[:] = [entry for entry in self._tasks if not (entry[0].done() or entry[0].cancelled())]
         return any(task.done() for task in tasks)
 
 
@@ -218,11 +218,11 @@ class Timeline:
                 self.stood += now - self._paused
             self._paused = None
 
-    def on_pause(self, asked: Any, answer: Any) -> Any:
+    def on_pause(self, request: Any, answer: Any) -> Any:
         """Pause the time, or resume it, as a service SetBool."""
-        self.pause(asked.data)
+        self.pause(request.data)
         answer.success = True
-        answer.message = f"{'paused' if asked.data else 'goes on'} at {self.elapsed():.2f} s"
+        answer.message = f"{'paused' if request.data else 'goes on'} at {self.elapsed():.2f} s"
         return answer
 
     def running(self) -> float:

@@ -16,7 +16,6 @@ from magnetosuture_msgs import msg
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import ProcedureState as StateMessage
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from std_msgs.msg import Header
 
@@ -88,9 +87,7 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
         ):
             self.serve(service, partial(self._serve, execute))
         self._action = ProcedureAction(self)
-        # Where simulated time stands still, a goal can be cancelled all the same.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD, self.while_active(self.on_timer), clock=steady)
+        self.every(PERIOD, self.while_active(self.on_timer))
 
     def release(self) -> None:
         """Offer the action no more."""

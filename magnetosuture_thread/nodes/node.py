@@ -41,9 +41,6 @@ from magnetosuture_thread.settings.errors import GraphError, shortened
 C = TypeVar("C", bound=Configuration)
 
 PERIOD = 1.0  # s between two reports of a node
-# Keys of the coil bridge's report, which its clients read.
-SCHEDULING = "scheduling"
-JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
 COMPILING = "compiling"  # how the state of a node begins that does
 MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 MAX_REQUEST_ENTRIES = 1000  # of a list in a request: each takes its time, and nothing else runs meanwhile
@@ -214,6 +211,10 @@ class GuardedNode(Node):
         """Offer a service, whose callback may raise."""
         answer = partial(_answer, self.get_logger(), service, callback)
         return self.create_service(topics.ros_class(service.type_name), service, answer)
+
+    def every(self, period: float, callback: Callable[[], None]) -> None:
+        """Call back each period [s] of a steady clock: simulated time may stand still."""
+        self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *arguments: Any, **options: Any

@@ -279,8 +279,8 @@ class LiveReplay(Participant):
                 self.losses.count_diagnostics(data)
             self._receive(topic.channel.recorded, self._time.now(), data)
 
-    def _on_pause(self, asked: Any, answer: Any) -> Any:
-        answer = self._time.on_pause(asked, answer)
+    def _on_pause(self, request: Any, answer: Any) -> Any:
+        answer = self._time.on_pause(request, answer)
         self._log(answer.message)
         return answer
 

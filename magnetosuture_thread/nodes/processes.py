@@ -27,13 +27,8 @@ _LIBC = ctypes.CDLL(None)  # loaded here, and not between fork and exec
 
 # What could lead a graph out of this machine or to another graph.
 LEADS_ELSEWHERE = (
-    "CYCLONEDDS_URI",
-    "FASTDDS_DEFAULT_PROFILES_FILE",
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-    "ROS_DISCOVERY_SERVER",
-    "ROS_NAMESPACE",
-    "ROS_STATIC_PEERS",
-    "ROS_SUPER_CLIENT",
+    *("CYCLONEDDS_URI", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_DISCOVERY_SERVER"),
+    *("ROS_NAMESPACE", "ROS_STATIC_PEERS", "ROS_SUPER_CLIENT"),
 )
 
 
@@ -71,13 +66,12 @@ def reserved_domain() -> Iterator[int]:
     Raises:
         GraphError: all are in use.
     """
-    first = os.getpid() % 100
     for offset in range(100):
-        domain = 1 + (first + offset) % 100
-        lock = Path(tempfile.gettempdir()) / f"magnetosuture_domain_{domain}_{os.getuid()}.lock"
-        with lock.open("w") as held:
+        domain = 1 + (os.getpid() + offset) % 100
+        path = Path(tempfile.gettempdir()) / f"magnetosuture_domain_{domain}_{os.getuid()}.lock"
+        with path.open("w") as lock:
             try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 continue
             if is_empty(domain):
@@ -160,15 +154,10 @@ class NodeProcesses:
         program = [module] if module else ["magnetosuture_thread.nodes.program", name]
         command = [*self._prefix, sys.executable, "-m", *program, "--ros-args", *self._arguments, *arguments]
         with (self._logs / f"{name}.log").open("wb") as log:
-            self._processes[name] = subprocess.Popen(
-                command,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is ours to pass on
-                preexec_fn=_end_with_parent,
-            )
+            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
+            # In a session of its own: Ctrl-C is ours to pass on.
+            options: dict[str, Any] = {"start_new_session": True, "preexec_fn": _end_with_parent}
+            self._processes[name] = subprocess.Popen(command, env=self._environment, **streams, **options)
 
     def prefer(self, name: str, priority: int) -> str:
         """Give a node a real-time priority, where the system allows any; return how it is scheduled then."""

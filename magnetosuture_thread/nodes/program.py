@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.settings.errors import missing_module
+from magnetosuture_thread.settings.interface import ALL_NODES
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.node import GuardedNode
@@ -28,16 +29,7 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOADING_GRACE = 1.0  # s to end in order for a process that is asked to while it loads
 DELIVERY_TIMEOUT = 0.2  # s for the last messages of all nodes to be acknowledged
 
-MAKERS = {
-    "vision_tracker": "VisionTrackerNode",
-    "thread_model": "ThreadModelNode",
-    "perception": "perception",
-    "coil_bridge": "CoilBridgeNode",
-    "scene_server": "SceneServerNode",
-    "needle_planner": "NeedlePlannerNode",
-    "path_follower": "PathFollowerNode",
-    "rig_simulator": "RigSimulatorNode",
-}
+MAKERS = {name: f"{name.title().replace('_', '')}Node" for name in ALL_NODES} | {"perception": "perception"}
 """What each program makes and runs, by its name, in the module of that name; the console runs itself."""
 
 
@@ -110,12 +102,12 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
 
     nodes: tuple[GuardedNode, ...] = ()
     executor: KeptWaitSetExecutor | None = None
-    asked = threading.Event()
+    is_ending = threading.Event()
     woken, written = os.pipe2(os.O_CLOEXEC)
 
     def end() -> None:
         os.read(woken, 1)
-        asked.set()
+        is_ending.set()
         while True:
             if executor is not None:
                 with suppress(Exception):  # it is gone already
@@ -141,7 +133,7 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
-        executor.spin_until(lambda: asked.is_set() or all(node.has_ended for node in nodes))
+        executor.spin_until(lambda: is_ending.is_set() or all(node.has_ended for node in nodes))
         _finish(nodes)
     except ExternalShutdownException:  # something else in this process has shut the context down
         return 0

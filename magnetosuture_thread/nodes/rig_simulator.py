@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from magnetosuture_msgs.msg import CoilCurrents
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
@@ -55,7 +54,6 @@ class RigSimulatorNode(GuardedNode):
             self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
             self.rig.warm_up()
         self._model = self.resolve_topic_name(topics.PREDICTED_THREAD.name)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.time = Timeline(EPOCH if self._simulated else self.get_clock().now().nanoseconds, rate)
         self.time.begin()
         self.serve(interface.Service.PAUSE_RIG, self.time.on_pause)
@@ -76,14 +74,14 @@ class RigSimulatorNode(GuardedNode):
         self._scene = SceneFollower(self, self.on_scene, scene)
         if self._simulated:
             self._clocks = topics.CLOCK.publisher(self)
-            self.create_timer(PERIOD / rate, self.on_clock, clock=steady)
-        self.create_timer(1.0 / (settings.frame_rate * rate), self.on_frame, clock=steady)
+            self.every(PERIOD / rate, self.on_clock)
+        self.every(1.0 / (settings.frame_rate * rate), self.on_frame)
         self._stage = stage = settings.power()  # simulated boards; None where currents come as messages
         if stage is None:
             topics.RIG_CURRENTS.subscribe(self, self.on_currents)
         else:
             stage.open()
-            self.create_timer(PERIOD, lambda: self._apply(stage.currents()), clock=steady)
+            self.every(PERIOD, lambda: self._apply(stage.currents()))
         self.get_logger().info("ready: everything here is simulated")
 
     def on_scene(self, scene: Scene) -> None:

@@ -32,10 +32,10 @@ class SceneServerNode(ManagedNode[SceneServerSettings]):
         self._scenes = topics.SCENE.publisher(self)
         self._markers = topics.SCENE_MARKERS.publisher(self)
         for service, change in (
-            (Service.LOAD_SCENE, lambda asked: editor.load(asked.file)),
-            (Service.ADD_SHAPE, lambda asked: editor.add(parse_shape_message(asked.shape))),
-            (Service.REPLACE_SHAPE, lambda asked: editor.replace(parse_shape_message(asked.shape))),
-            (Service.REMOVE_SHAPE, lambda asked: editor.remove(asked.name)),
+            (Service.LOAD_SCENE, lambda request: editor.load(request.file)),
+            (Service.ADD_SHAPE, lambda request: editor.add(parse_shape_message(request.shape))),
+            (Service.REPLACE_SHAPE, lambda request: editor.replace(parse_shape_message(request.shape))),
+            (Service.REMOVE_SHAPE, lambda request: editor.remove(request.name)),
         ):
             self.serve(service, partial(self._change, change))
 
@@ -46,12 +46,12 @@ class SceneServerNode(ManagedNode[SceneServerSettings]):
         else:
             self._publish(self._editor.scene)
 
-    def _change(self, change: Callable[[Any], object], asked: Any, answer: Any) -> Any:
+    def _change(self, change: Callable[[Any], object], request: Any, answer: Any) -> Any:
         """Change the scene, and say what became of it."""
         self.require_active()
         before = self._editor.scene
         try:
-            change(asked)
+            change(request)
         except MagnetosutureError as error:
             answer.success, answer.message = False, str(error)
             self.health.refuse(error)

@@ -8,7 +8,6 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from magnetosuture_thread import InvalidInputError, Scene
@@ -57,9 +56,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         topic = topics.COMPRESSED_IMAGE if settings.image_transport == "compressed" else topics.IMAGE
         self._camera = topic.subscribe(self, self.while_active(self.on_image)).topic_name
         self._start_session(settings, self._scene.load(settings.scene))
-        # Simulated time may stand still; that the camera is silent must be noticed all the same.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=steady)
+        self.every(0.5 * SILENCE, self.while_active(self.on_watch))
         self.get_logger().info(f"ready: frames from {self._camera}")
 
     def activate(self) -> None:

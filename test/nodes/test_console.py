@@ -1,17 +1,21 @@
-"""The operator's page's side of a graph, with the real coil bridge."""
+"""The operator's page's side of a graph, with the real coil bridge, and what it is told of each message."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point
+from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins, ThreadForecast
 from rclpy.node import Node
 
 from magnetosuture_thread.console.settings import ConsoleSettings
@@ -22,6 +26,7 @@ from magnetosuture_thread.nodes.clients import Participant
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
+from magnetosuture_thread.settings.errors import InvalidInputError
 from test.nodes import wire
 
 
@@ -190,3 +195,57 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     assert commands == []
     console.blocked = "starting"
     assert asyncio.run(console.execute_procedure("plan", near, False)) == "starting"
+
+
+def plain(shown: Any) -> Any:
+    """Return what a page gets; a value that JSON does not know is an error."""
+    return json.loads(json.dumps(shown, allow_nan=False))
+
+
+def test_the_forecast_has_ghosts_and_what_happens_first():
+    """Eleven instants of two nodes, which move by 1 mm in each."""
+    positions = [Point(x=1e-3 * k, y=0.1 * node) for k in range(11) for node in range(2)]
+    message = ThreadForecast(time=[0.3 * k for k in range(11)], horizon=3.0, positions=positions)
+    message.contact_time, message.contact_shape = 1.44, "left_tissue"
+    message.friction_time, message.rest_time = 0.81, math.nan
+    shown = plain(console_graph.forecast(message))
+    assert shown["events"] == ["friction in 0.8 s", "touches the left tissue in 1.4 s"]
+    assert [ghost["time"] for ghost in shown["ghosts"]] == pytest.approx([0.9, 2.1, 3.0])
+    assert shown["ghosts"][-1]["vertices"] == [[0.01, 0.0], [0.01, 0.1]]
+    # What holds already is not announced; a needle that rests is.
+    message.contact_time, message.friction_time, message.rest_time = 0.0, 0.0, 0.0
+    assert plain(console_graph.forecast(message))["events"] == ["needle rests"]
+    message.positions = positions[:-1]
+    with pytest.raises(InvalidInputError, match="as many positions at each instant"):
+        console_graph.forecast(message)
+
+
+def test_of_each_node_the_least_clearance_of_wall_and_shapes():
+    message = SafetyMargins(
+        valid=True,
+        barrier_names=["connectivity", "obstacle", "wall"],
+        barrier=[0, 1, 1, 1, 2],
+        node=[3, 1, 1, 2, 4],
+        obstacle=[-1, 0, 1, 1, -1],
+        value=[0.0] * 5,
+        clearance=[0.0, 5e-4, 2e-4, 0.0, 3e-4],
+        minimum=[
+            BarrierMargin(barrier="obstacle", node=2, clearance=0.0),
+            BarrierMargin(barrier="connectivity", clearance=1e-6),
+        ],
+        contact_nodes=[2],
+        friction_state=SafetyMargins.FRICTION_SLIDING,
+        friction_nodes=[1, 2],
+        slowdown=0.81,
+    )
+    shown = plain(console_graph.margins(message))
+    assert shown["clearance"] == [None, 2e-4, 0.0, None, 3e-4]
+    assert shown["least"] == {"obstacle": 0.0, "connectivity": 1e-6}
+    assert shown["contact"] == [2]
+    assert shown["friction"] == {"state": "sliding", "nodes": [1, 2], "slowdown": 0.81}
+    assert (shown["valid"], shown["reason"]) == (True, "")
+
+
+def test_margins_of_a_node_that_no_thread_has_are_refused():
+    with pytest.raises(InvalidInputError, match="less than 2001"):
+        console_graph.margins(SafetyMargins(valid=True, node=[4294967295], barrier=[0], clearance=[0.0]))

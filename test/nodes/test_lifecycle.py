@@ -1,8 +1,7 @@
-"""The lifecycle of the nodes that hold no boards: what each does in its states, and how it comes back."""
+"""The lifecycle of the nodes that hold no boards: what each does and says in its states, and how it comes back."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import ProcedureState
@@ -17,14 +17,16 @@ from magnetosuture_msgs.srv import PlanProcedure
 from std_srvs.srv import Trigger
 
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import INACTIVE
+from magnetosuture_thread.nodes.node import INACTIVE, Health
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.settings.interface import STANDBY_NODES, Service
 from test.nodes import wire
 from test.nodes.conftest import Graph
 from test.nodes.makers import EVERY_NODE
 from test.nodes.test_needle_planner import FAR, Bench
+from test.nodes.test_path_follower import pose
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
@@ -36,7 +38,6 @@ ACTIVE = {  # how the first report of each begins while it is active
     "path_follower": "no needle pose yet",
     "scene_server": "scene ",
 }
-BEGIN = int(time.time()) + 3600  # s; late poses are refused, however slowly a test runs
 
 
 def state_of(reports: list[Any]) -> str:
@@ -85,8 +86,8 @@ def test_an_inactive_model_predicts_nothing(graph: Graph):
     graph.add(ThreadModelNode, autostart="inactive", initial_shape="straight")
     predicted = graph.listen(topics.PREDICTED_THREAD)
     for second in (1, 2):
-        pose = wire.pose_message(Time(sec=second), np.zeros(2), np.array([1.0, 0.0]))
-        graph.publish(topics.NEEDLE_POSE, pose)
+        message = wire.pose_message(Time(sec=second), np.zeros(2), np.array([1.0, 0.0]))
+        graph.publish(topics.NEEDLE_POSE, message)
         assert second == 2 or graph.change("thread_model", ACTIVATE)
     graph.wait(lambda: bool(predicted), "a prediction")
     assert [each.header.stamp.sec for each in predicted] == [2]
@@ -142,8 +143,7 @@ def test_the_path_follower_stops_the_needle_and_goes_on_where_it_was(graph: Grap
     commands, setpoints = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.TIP_SETPOINT)
 
     def show(second: float) -> None:
-        stamp = Time(sec=BEGIN + int(second), nanosec=round((second % 1.0) * 1e9))
-        graph.publish(topics.NEEDLE_POSE, wire.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
+        graph.publish(topics.NEEDLE_POSE, pose(second, 0.0))
 
     def answered(index: int) -> bool:
         return len(commands) > index
@@ -166,3 +166,17 @@ def test_the_path_follower_stops_the_needle_and_goes_on_where_it_was(graph: Grap
     assert reached <= setpoints[-1].pose.position.x < reached + 1e-3
     assert graph.change("path_follower", DEACTIVATE, CLEANUP, CONFIGURE)
     graph.wait(lambda: values_of(reports)["progress"] == "0.0", "the path from its beginning")
+
+
+def test_a_flood_of_refusals_is_counted_and_not_repeated(graph):
+    said = graph.listen_later(topics.DIAGNOSTICS)
+    health = Health(graph.probe)
+    graph.wait(lambda: graph.matched(topics.DIAGNOSTICS), "the match")
+    for index in range(1000):
+        health.refuse(InvalidInputError("field", index, "something else"))
+    graph.wait(
+        lambda: any({v.key: v.value for v in d.status[0].values}["refused"] == "1000" for d in said), "the count"
+    )
+    assert len(said) < 20
+    assert said[-1].status[0].level == DiagnosticStatus.WARN
+    assert said[-1].status[0].hardware_id == (graph.probe.get_namespace().strip("/") or "magnetosuture")

@@ -73,20 +73,9 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph, bench: Bench):
     assert bench.node.settings.rest_curvature == 20.0
 
 
-REFUSED = (
-    ({"segments": 400}, "longer than thick"),
-    ({"fixed_nodes": [1] * 200_000}, "200000 entries"),
-    ({"viscosity": 0.5, "solver": "osqp"}, "thread_model.solver: got 'osqp', expected its value in force"),
-)
-
-
 def test_a_refused_parameter_leaves_all_as_it_was(bench: Bench):
     bench.show(2)
     before = bench.node.settings
-    for values, words in REFUSED:
-        reason = bench.set(**values)
-        assert words in reason
-        assert "\n" not in reason
-        assert len(reason) < 700
-        assert bench.node.settings is bench.node._session.settings is before
+    assert "longer than thick" in bench.set(segments=400, viscosity=0.3)
+    assert bench.node.settings is bench.node._session.settings is before
     bench.show(2)
