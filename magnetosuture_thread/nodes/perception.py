@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.settings.errors import GraphError
@@ -25,7 +24,7 @@ def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
     """
     tracker = VisionTrackerNode(**options)
     try:
-        model = ThreadModelNode(listens=False, **options)
+        model = ThreadModelNode(tracker=tracker, **options)
     except BaseException:
         tracker.destroy_node()
         raise
@@ -33,9 +32,4 @@ def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
         tracker.destroy_node()
         model.destroy_node()
         raise GraphError(f"two nodes cannot both be named {name}: rename each, as by -r vision_tracker:__node:=NAME")
-    shared = (topics.NEEDLE_POSE.name, topics.THREAD_OBSERVATION.name)
-    if all(tracker.resolve_topic_name(name) == model.resolve_topic_name(name) for name in shared):
-        tracker.follower = model.on_tracked
-    else:
-        model.listen()
     return tracker, model

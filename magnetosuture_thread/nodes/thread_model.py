@@ -51,19 +51,23 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
     state.
 
     Args:
-        listens: whether poses and observations of the thread come by topics; else a tracker in the same process
-            hands them over.
+        tracker: node in the same process; it hands over what it sees, unless topics of these nodes are renamed.
         options: for rclpy's node.
     """
 
-    def __init__(self, *, listens: bool = True, **options: Any) -> None:
+    def __init__(self, *, tracker: Any = None, **options: Any) -> None:
         super().__init__("thread_model", ThreadModelSettings, fixed=FIXED, **options)
         self._scene = SceneFollower(self, self.on_scene)
         self._states = ThreadHealth(self.health)
         self._forecasts: ThreadForecasts | None = None
-        topics.MATERIAL.subscribe(self, self.on_material)
         self._observed = False
-        self._listens = listens
+        topics.MATERIAL.subscribe(self, self.on_material)
+        shared = (topics.NEEDLE_POSE.name, topics.THREAD_OBSERVATION.name)
+        self._is_handed = tracker is not None and all(
+            tracker.resolve_topic_name(name) == self.resolve_topic_name(name) for name in shared
+        )
+        if self._is_handed:
+            tracker.follower = self.on_tracked
         self.start()
 
     def allocate(self, settings: ThreadModelSettings) -> None:
@@ -75,25 +79,14 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
         self._publish = topics.publishing(self, topics.PREDICTED_THREAD, topics.ESTIMATED_THREAD, topics.MARGINS)
         self._markers = topics.THREAD_MARKERS.publisher(self)
         self._last_margins = 0  # stamp of those that were published [ns]
-        if self._listens:
-            self._subscribe()
+        if not self._is_handed:
+            observation, measured = self.on_observation_message, self.on_measured_thread_message
+            topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True)
+            topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True)
+            topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose))
         where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
         model = f"{where}, {settings.formulation} by {settings.solver}"
         self.get_logger().info(f"ready: {settings.segments} segments of {settings.material}, {model}")
-
-    def listen(self) -> None:
-        """Take needle poses, and what is seen of the thread, by topics from now on."""
-        self._listens = True
-        if self.settings is not None:
-            self._subscribe()
-
-    def _subscribe(self) -> None:
-        for topic, take in (
-            (topics.THREAD_OBSERVATION, self.on_observation_message),
-            (topics.MEASURED_THREAD, self.on_measured_thread_message),
-        ):
-            topic.subscribe(self, self.while_active(take), raw=True)
-        topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose))
 
     def activate(self) -> None:
         """Wait for a needle pose."""
