@@ -89,7 +89,7 @@ class Health:
         self._values.update(values)
 
     def refuse(self, problem: Exception, **values: object) -> None:
-        """Say that an input was refused; the node itself goes on. An error that it has said before stays said."""
+        """Report that an input was refused; the node itself goes on. An error that it has reported before stays."""
         self._refused += 1
         self._last_refusal = shortened(str(problem), MAX_REASON_CHARS)
         if self._level == DiagnosticStatus.ERROR:

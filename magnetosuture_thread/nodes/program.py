@@ -80,7 +80,7 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
 
     rclpy's own handlers would take the nodes out of the graph at once, before they can publish their final messages. A
     signal raises nothing: a KeyboardInterrupt out of a library that calls Python comes out as another error, or is
-    lost. A thread hears of it, as Python runs no handler while the compiler is at work. It wakes the executor, and ends
+    lost. A worker hears of it, as Python runs no handler while the compiler is at work. It wakes the executor, and ends
     a process that goes on loading. No coil has a current then: see `Health.load`.
 
     Args:

@@ -322,7 +322,7 @@ class ThreadForecasts:
         self._choice.on_plan(reading.path_poses(message, topics.PROCEDURE_PLAN.name))
 
     def request(self, result: PredictionResult, pose: NeedlePose) -> None:
-        """Queue the forecast from an estimate; the worker thread makes and publishes it.
+        """Queue the forecast from an estimate; a worker makes and publishes it.
 
         Args:
             result: of the pose.
