@@ -17,17 +17,7 @@ from aiohttp import web
 
 from magnetosuture_thread.console.client import Client, Graph, Host, RequestHandler, encode_frame, encode_state
 from magnetosuture_thread.console.jog_controller import JogController
-from magnetosuture_thread.console.settings import (
-    ConsoleSettings,
-    RateCounter,
-    host_refusal,
-    is_any,
-    new_token,
-    origin_refusal,
-    page_url,
-    same_token,
-    server_origin,
-)
+from magnetosuture_thread.console.settings import ConsoleSettings, RateCounter, new_token, same_token
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 MAX_CLIENTS = 16  # with the token
@@ -66,7 +56,6 @@ class ConsoleServer:
         self._clients: dict[int, Client] = {}
         self._new_watchers, self._request_rate = RateCounter(), RateCounter()
         self._count = self._port = 0
-        self._scheme = "https" if settings.certificate else "http"
         self._frame_number, self._frame = -1, b""
         self._transports: WeakSet[asyncio.Transport] = WeakSet()
         self._runner: web.ServerRunner | None = None
@@ -94,8 +83,7 @@ class ConsoleServer:
         # Excludes loaded objects from garbage collection, which would take tens of milliseconds each time.
         gc.collect()
         gc.freeze()
-        own = server_origin("127.0.0.1" if is_any(address) else address, self._port, self._scheme)
-        return page_url(self._settings.origin or own, self._token)
+        return self._settings.page_url(self._port, self._token)
 
     async def stop(self) -> None:
         """Stop the needle, then close all connections; raise the error that ended the broadcast, if any."""
@@ -121,9 +109,7 @@ class ConsoleServer:
             now = asyncio.get_running_loop().time()
             if self._request_rate.count(request.remote or "", now) > 100:  # those beyond wait for the next second
                 await asyncio.sleep(1.0 - now % 1.0)
-        settings, host = self._settings, request.headers.get("Host", "")
-        refusal = host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
-        if refusal:
+        if refusal := self._settings.host_refusal(request.headers.get("Host", ""), self._port):
             return _answer(403, refusal)
         if request.method not in ("GET", "HEAD"):
             return _answer(405, "only GET")
@@ -139,7 +125,7 @@ class ConsoleServer:
 
     async def _connect(self, request: web.BaseRequest) -> web.StreamResponse:
         origin, host = (request.headers.get(name, "") for name in ("Origin", "Host"))
-        if refusal := origin_refusal(origin, host, scheme=self._scheme, allowed=self._settings.origin):
+        if refusal := self._settings.origin_refusal(origin, host):
             return _answer(403, refusal)
         # Only for a place: commands need the token of the greeting.
         has_token = same_token(request.query.get("token"), self._token)

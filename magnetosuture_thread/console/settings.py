@@ -69,6 +69,60 @@ class ConsoleSettings(shared.SceneName, shared.NeedleArc):
                 value = "…" if name == "token" and self.token else getattr(self, name)  # no token is shown
                 raise ConfigurationError(f"{self.GROUP}.{name}", value, expectation)
 
+    @property
+    def scheme(self) -> str:
+        """Return the scheme of the server: https where it has a certificate."""
+        return "https" if self.certificate else "http"
+
+    def page_url(self, port: int, token: str) -> str:
+        """Return the URL of the page on a port; the token is in the fragment, which browsers do not send."""
+        numeric = _numeric(self.address)
+        address = "127.0.0.1" if numeric is not None and numeric.is_unspecified else self.address
+        host = f"[{address}]" if ":" in address else address
+        return f"{self.origin or f'{self.scheme}://{host}:{port}'}/#token={quote(token, safe='')}"
+
+    def is_own_host(self, host: str) -> bool:
+        """Return whether a Host header is that of the origin under which the page is reached besides."""
+        return bool(self.origin) and host.lower() == urlsplit(self.origin).netloc.lower()
+
+    def host_refusal(self, host: str, port: int) -> str:
+        """Return why a request for a host is rejected; empty if it is accepted.
+
+        Names that others can point to this machine are rejected: a loopback server accepts only loopback names, others
+        only the bound address, or any numeric address if all are bound; and each the host of the configured origin.
+
+        Args:
+            host: the request's Host header.
+            port: that the server is bound to.
+        """
+        if self.is_own_host(host):
+            return ""
+        parts = _split(host, DEFAULT_PORTS[self.scheme])
+        if parts is None:
+            return f"Host: got {host[:80]!r}, expected a host and a port"
+        name, request_port = parts
+        if request_port != port:
+            return f"Host: got port {request_port}, expected {port}"
+        bound, numeric = _numeric(self.address), _numeric(name)
+        is_local = is_loopback(name) and is_loopback(self.address)
+        is_any = bound is not None and bound.is_unspecified and numeric is not None
+        is_ours = name == self.address.lower() or is_local or is_any
+        return "" if is_ours else f"Host: got {name[:80]!r}, expected {self.address}"
+
+    def origin_refusal(self, origin: str, host: str) -> str:
+        """Return why a WebSocket of an origin is rejected; empty if it is accepted.
+
+        Args:
+            origin: the request's Origin header; empty for programs other than browsers.
+            host: the request's Host header, already accepted.
+        """
+        # By the other name's host a page comes from its origin alone: a plain one could be another's on the way.
+        expected = [] if self.is_own_host(host) else [f"{self.scheme}://{host}"]
+        expected += [self.origin] if self.origin else []
+        if not origin or origin.lower() in map(str.lower, expected):
+            return ""
+        return f"Origin: got {origin[:80]!r}, expected {' or '.join(expected)}"
+
 
 class RateCounter:
     """Counts what comes from each address within a second."""
@@ -86,12 +140,8 @@ class RateCounter:
 
 def is_loopback(address: str) -> bool:
     """Return whether only this machine can reach an address."""
-    return (numeric := _numeric(address)) is not None and numeric.is_loopback
-
-
-def is_any(address: str) -> bool:
-    """Return whether an address stands for all of this machine."""
-    return (numeric := _numeric(address)) is not None and numeric.is_unspecified
+    numeric = _numeric(address)
+    return numeric is not None and numeric.is_loopback
 
 
 def _numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -114,64 +164,10 @@ def same_token(candidate: object, token: str) -> bool:
     return hmac.compare_digest(candidate.encode(errors="replace"), token.encode())
 
 
-def server_origin(address: str, port: int, scheme: str = "http") -> str:
-    """Return the origin of a server's pages, as `http://127.0.0.1:8090`."""
-    host = f"[{address}]" if ":" in address else address
-    return f"{scheme}://{host}:{port}"
-
-
-def page_url(origin: str, token: str) -> str:
-    """Return the URL of the page; the token is in the fragment, which browsers do not send."""
-    return f"{origin}/#token={quote(token, safe='')}"
-
-
 def is_origin(text: str) -> bool:
     """Return whether a text is the origin of a website: scheme, name, and a port if it is not the scheme's own."""
     parts = urlsplit(text)
     return parts.scheme in DEFAULT_PORTS and text == f"{parts.scheme}://{parts.netloc}" and bool(_split(parts.netloc))
-
-
-def host_refusal(host: str, address: str, port: int, *, scheme: str = "http", origin: str = "") -> str:
-    """Return why a request for this host is rejected; empty if it is accepted.
-
-    Names that others can point to this machine are rejected: a loopback server accepts only loopback names, others
-    only the bound address, or any numeric address if all are bound; and each the host of the configured origin.
-
-    Args:
-        host: the request's Host header.
-        address: that the server is bound to.
-        port: that the server is bound to.
-        scheme: of the server.
-        origin: under which the page is reached besides; empty if there is no other.
-    """
-    if origin and host.lower() == urlsplit(origin).netloc.lower():
-        return ""
-    parts = _split(host, DEFAULT_PORTS[scheme])
-    if parts is None:
-        return f"Host: got {host[:80]!r}, expected a host and a port"
-    name, request_port = parts
-    if request_port != port:
-        return f"Host: got port {request_port}, expected {port}"
-    local, numeric = is_loopback(name) and is_loopback(address), is_any(address) and _numeric(name) is not None
-    return "" if name == address.lower() or local or numeric else f"Host: got {name[:80]!r}, expected {address}"
-
-
-def origin_refusal(origin: str, host: str, *, scheme: str = "http", allowed: str = "") -> str:
-    """Return why a WebSocket of this origin is rejected; empty if it is accepted.
-
-    Args:
-        origin: the request's Origin header; empty for programs other than browsers.
-        host: the request's Host header, already accepted.
-        scheme: of the server.
-        allowed: origin under which the page is reached besides; empty if there is no other.
-    """
-    by_address = f"{scheme}://{host}"
-    # By the other name's host a page comes from its origin alone: a plain one could be another's on the way.
-    by_name = bool(allowed) and host.lower() == urlsplit(allowed).netloc.lower()
-    expected = [allowed] if by_name else [by_address, *([allowed] if allowed else [])]
-    if not origin or origin.lower() in map(str.lower, expected):
-        return ""
-    return f"Origin: got {origin[:80]!r}, expected {' or '.join(expected)}"
 
 
 def _split(host: str, default_port: int = 0) -> tuple[str, int] | None:

@@ -150,7 +150,7 @@ class Inbox:
         self._messages.append((data, info["received_timestamp"]))
 
 
-class Latest:
+class Latest(Inbox):
     """Content of the latest message of a topic.
 
     Args:
@@ -172,20 +172,19 @@ class Latest:
         period: float = 0.0,
         max_bytes: float = math.inf,
     ) -> None:
-        self._inbox = Inbox(node, topic, 1)
-        self._read, self._period, self._max_bytes = read, period, max_bytes
+        super().__init__(node, topic, 1)
+        self._convert, self._period, self._max_bytes = read, period, max_bytes
         self._next_read, self._arrived = 0.0, 0
         self.value: Any = None
-        self.close = self._inbox.close
 
     def poll(self) -> bool:
         """Read the latest message, if there is one; return whether there is a new value."""
         now = time.monotonic()
-        for data, arrived in self._inbox.take() if now >= self._next_read else ():
+        for data, arrived in self.take() if now >= self._next_read else ():
             # Whatever is wrong with a message, the one before stays.
             with suppress(Exception):
                 if len(data) <= self._max_bytes:
-                    self.value = self._read(self._inbox.topic.decode(data))
+                    self.value = self._convert(self.topic.decode(data))
                     self._arrived, self._next_read = arrived, now + self._period
                     return True
         return False
@@ -316,11 +315,8 @@ class CoilClient(Participant):
         }
 
     def _wait_for_state(self) -> CoilBridgeState:
-        def latest() -> Any:
-            self._state.poll()
-            return self._state.value
-
-        return self.wait_for(latest, "no coil_bridge state received on this ROS domain")
+        problem = "no coil_bridge state received on this ROS domain"
+        return self.wait_for(lambda: self._state.value if self._state.poll() else None, problem)
 
     def _call(self, name: str, request: Any, **options: Any) -> Any:
         try:

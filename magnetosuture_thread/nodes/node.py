@@ -249,7 +249,10 @@ def _answer(logger: Any, name: str, callback: Callable[[Any, Any], Any], request
     """Return the answer of a service's callback; of one that raises, an error in the service's own form."""
     reason = ""
     try:
-        _check_lengths(request)
+        for field in request.get_fields_and_field_types():  # lists that would take long to go through
+            value = getattr(request, field)
+            if isinstance(value, (list, tuple)) and len(value) > MAX_REQUEST_ENTRIES:
+                raise InvalidInputError(field, f"{len(value)} entries", f"at most {MAX_REQUEST_ENTRIES}")
         if isinstance(request, SetParameters.Request):
             # Each for itself: one that fails must not hide what became of those before it.
             response.results = [_set_parameter(callback, parameter) for parameter in request.parameters]
@@ -277,14 +280,6 @@ def _set_parameter(callback: Callable[[Any, Any], Any], parameter: Any) -> SetPa
 def reason_of(error: Exception) -> str:
     """Return the text of an error as it may be logged and answered."""
     return shortened(str(error) or type(error).__name__, MAX_REASON_CHARS)
-
-
-def _check_lengths(request: Any) -> None:
-    """Refuse a request whose lists would take long to go through."""
-    for name in request.get_fields_and_field_types():
-        value = getattr(request, name)
-        if isinstance(value, (list, tuple)) and len(value) > MAX_REQUEST_ENTRIES:
-            raise InvalidInputError(name, f"{len(value)} entries", f"at most {MAX_REQUEST_ENTRIES}")
 
 
 def _refused(response: Any, reason: str, request: Any) -> Any:

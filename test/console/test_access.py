@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from magnetosuture_thread.console.client import MAX_UNACKNOWLEDGED, Outbox
-from magnetosuture_thread.console.settings import (
-    ConsoleSettings,
-    host_refusal,
-    is_loopback,
-    new_token,
-    origin_refusal,
-    page_url,
-    same_token,
-    server_origin,
-)
+from magnetosuture_thread.console.settings import ConsoleSettings, is_loopback, new_token, same_token
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 TOKEN = "a-token-of-the-tests"
+
+
+def settings(address: str = "127.0.0.1", **options: Any) -> ConsoleSettings:
+    """Return settings of a server that is bound to an address."""
+    return ConsoleSettings(address=address, token=TOKEN, **options)
 
 
 def test_the_addresses_of_this_machine_alone():
@@ -64,8 +62,8 @@ def test_tokens_are_compared_whole():
 
 def test_every_start_has_a_token_of_its_own_and_it_is_in_the_fragment_alone():
     assert new_token() != new_token()
-    assert page_url(server_origin("127.0.0.1", 8090), "a%b#c") == "http://127.0.0.1:8090/#token=a%25b%23c"
-    assert page_url(server_origin("::1", 80, "https"), "t").startswith("https://[::1]:80/#")
+    assert ConsoleSettings().page_url(8090, "a%b#c") == "http://127.0.0.1:8090/#token=a%25b%23c"
+    assert settings("::1", certificate="c.pem").page_url(80, "t").startswith("https://[::1]:80/#")
 
 
 LOCAL, RIG = "127.0.0.1", "https://rig.example"
@@ -92,18 +90,18 @@ OTHERS: dict[str, list[tuple[str, dict[str, str]]]] = {
 @pytest.mark.parametrize("address", HOSTS)
 def test_own_names_and_those_of_a_certificate_or_a_proxy_are_accepted(address: str):
     for host, options in HOSTS[address]:
-        assert host_refusal(host, address, 8090, **options) == ""
+        assert settings(address, **options).host_refusal(host, 8090) == ""
 
 
 @pytest.mark.parametrize("address", OTHERS)
 def test_other_names_are_refused(address: str):
     for host, options in OTHERS[address]:
-        assert "Host" in host_refusal(host, address, 8090, **options)
+        assert "Host" in settings(address, **options).host_refusal(host, 8090)
 
 
 def test_over_tls_a_host_without_a_port_is_the_default_one():
-    assert host_refusal("rig.example", "rig.example", 443, scheme="https") == ""
-    assert host_refusal("rig.example", "rig.example", 443) != ""
+    assert settings("rig.example", certificate="c.pem").host_refusal("rig.example", 443) == ""
+    assert settings("rig.example").host_refusal("rig.example", 443) != ""
 
 
 @pytest.mark.parametrize(
@@ -113,16 +111,16 @@ def test_over_tls_a_host_without_a_port_is_the_default_one():
         ("http://127.0.0.1:8090", "127.0.0.1:8090", {}, True),
         *((origin, "127.0.0.1:8090", {}, False) for origin in ("http://evil.example", "null", "http://127.0.0.1:80")),
         *((origin, "127.0.0.1:8090", {}, False) for origin in ("https://127.0.0.1:8090", "http://localhost:8090")),
-        ("https://127.0.0.1:8090", "127.0.0.1:8090", {"scheme": "https"}, True),
-        ("http://127.0.0.1:8090", "127.0.0.1:8090", {"scheme": "https"}, False),
-        *((RIG, host, {"allowed": RIG}, True) for host in ("rig.example", "RIG.example", "127.0.0.1:8090")),
-        ("http://rig.example", "rig.example", {"allowed": RIG}, False),
-        ("https://rig.example:8090", "rig.example", {"allowed": RIG}, False),
-        ("https://evil.example", "rig.example", {"allowed": RIG}, False),
+        ("https://127.0.0.1:8090", "127.0.0.1:8090", {"certificate": "c.pem"}, True),
+        ("http://127.0.0.1:8090", "127.0.0.1:8090", {"certificate": "c.pem"}, False),
+        *((RIG, host, {"origin": RIG}, True) for host in ("rig.example", "RIG.example", "127.0.0.1:8090")),
+        ("http://rig.example", "rig.example", {"origin": RIG}, False),
+        ("https://rig.example:8090", "rig.example", {"origin": RIG}, False),
+        ("https://evil.example", "rig.example", {"origin": RIG}, False),
     ],
 )
 def test_only_our_own_page_opens_the_socket(origin: str, host: str, options: dict[str, str], is_ours: bool):
-    assert ("Origin" not in origin_refusal(origin, host, **options)) == is_ours
+    assert ("Origin" not in settings(**options).origin_refusal(origin, host)) == is_ours
 
 
 def test_a_page_that_is_behind_gets_the_newest_only():
