@@ -57,11 +57,6 @@ MAX_NODES = 32  # shown
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
 MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
 
-PROCEDURE_ACTIONS = {
-    "resume": Service.RESUME_PROCEDURE,
-    "pause": Service.PAUSE_PROCEDURE,
-    "abort": Service.ABORT_PROCEDURE,
-}
 RECORDED_TOPICS = tuple(
     dict.fromkeys((*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *topics.PROCEDURES))
 )
@@ -132,7 +127,7 @@ class ConsoleGraph:
         if self.blocked:
             return self.blocked
         if action != "plan":
-            return await self.call(PROCEDURE_ACTIONS[action], Trigger.Request())
+            return await self.call(interface.SERVICES[f"procedure/{action}"], Trigger.Request())
         request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
         # A long way takes some seconds, and is planned once.
         return await self.call(Service.PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)

@@ -20,6 +20,7 @@ from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Participant, listen
 from magnetosuture_thread.nodes.executor import Timeline
+from magnetosuture_thread.nodes.node import read_status
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 
@@ -84,7 +85,7 @@ class Losses:
     def count_diagnostics(self, data: bytes) -> None:
         """Count a node's status on /diagnostics."""
         for status in topics.DIAGNOSTICS.decode(data).status:
-            values, node = {pair.key: pair.value for pair in status.values}, status.name.split(":")[0]
+            (_, values), node = read_status(status), status.name.split(":")[0]
             if node == "vision_tracker":
                 self.frames_taken = max(self.frames_taken, int(values.get("frames", "0")))
             self._refused[node] = int(values.get("refused", "0"))
@@ -176,10 +177,7 @@ class LiveReplay(Participant):
             missing += [topic.name for topic, subscription in heard if not subscription.get_publisher_count()]
             if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")
-            if missing:
-                complete = None
-            elif complete is None:
-                complete = time.perf_counter()
+            complete = None if missing else complete or time.perf_counter()
             if time.perf_counter() > deadline:
                 raise GraphError(f"after {START_TIMEOUT:g} s the graph is not complete: nobody at {', '.join(missing)}")
 
