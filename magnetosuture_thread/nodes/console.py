@@ -7,31 +7,27 @@ from __future__ import annotations
 
 import asyncio
 import math
-import signal
-import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
 from magnetosuture_msgs import msg
 from magnetosuture_msgs.srv import PlanProcedure
 from nav_msgs.msg import Path
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import Disc, InvalidInputError, MagnetosutureError, Scene, SceneShape, read_scene
+from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape, read_scene
 from magnetosuture_thread.bags.markers import forecast_events
 from magnetosuture_thread.bags.packing import packed_header, packed_point, packed_twist
 from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose
 from magnetosuture_thread.bags.scene_message import parse_scene_message
-from magnetosuture_thread.console.server import ConsoleServer, serve_until
+from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
@@ -39,8 +35,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import ACTIONS, Inbox, Latest, Services
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
-from magnetosuture_thread.nodes.parameters import declare, init
-from magnetosuture_thread.nodes.program import end_signals
+from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.settings import interface
@@ -309,45 +304,29 @@ class GraphHost:
         return next((name for name in pauses if self.graph.services.ready(name)), "")
 
 
-async def _serve(node: GuardedNode, settings: ConsoleSettings) -> None:
-    """Serve the page until the process is asked to end; answer the node's services and publish its health."""
-    graph = ConsoleGraph(node, settings)
-    node.health.ok(f"serving on {settings.address}")
+class ConsoleNode(GuardedNode):
+    """Serves the page for the graph that it is in."""
 
-    async def watch() -> None:
-        graph.spin()
+    def __init__(self, **options: Any) -> None:
+        services = {"parameter_overrides": [Parameter("start_type_description_service", value=False)]}
+        super().__init__(NAME, **{**services, **options})
+        self._settings = declare(self, ConsoleSettings, options)
 
-    def report(url: str) -> None:
-        print(f"the operator's page: {url}", flush=True)
+    def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
+        """Serve the page, answer services and publish the node's health; at the end the needle is stopped first."""
+        asyncio.run(self._serve(is_over))
 
-    await serve_until(end_signals(), ConsoleServer(settings, graph, GraphHost(graph)), watch, 0.05, report)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program; return 0 when it was terminated, 1 when it could not start."""
-    node = None
-    for which in end_signals():  # also amid the start
-        signal.signal(which, signal.default_int_handler)
-    try:
-        init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-        options = {"parameter_overrides": [Parameter("start_type_description_service", value=False)]}
-        node, executor = GuardedNode(NAME, **options), KeptWaitSetExecutor()
-        executor.add_node(node)
-        asyncio.run(_serve(node, declare(node, ConsoleSettings, options)))
-    except KeyboardInterrupt:
-        return 0
-    except (MagnetosutureError, ParameterException, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
-    finally:
-        for which in end_signals():  # a second one must not interrupt what follows
-            signal.signal(which, signal.SIG_IGN)
-        if node is not None:
-            if node.executor is not None:
-                node.executor.shutdown()
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+    async def _serve(self, is_over: Callable[[], bool]) -> None:
+        graph = ConsoleGraph(self, self._settings)
+        server = ConsoleServer(self._settings, graph, GraphHost(graph))
+        print(f"the operator's page: {await server.start()}", flush=True)
+        self.health.ok(f"serving on {self._settings.address}")
+        try:
+            while not is_over():
+                graph.spin()
+                await asyncio.sleep(0.02)
+        finally:
+            await server.stop()
 
 
 def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.parameters import declare, plain_value
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
@@ -199,6 +200,10 @@ class GuardedNode(Node):
 
     def own_process(self) -> None:
         """Do what concerns the whole process, where the node is alone in it."""
+
+    def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
+        """Do the work of this node, and of all others in its executor, until it is over."""
+        executor.spin_until(is_over)
 
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""

@@ -30,7 +30,7 @@ LOADING_GRACE = 1.0  # s to end in order for a process that is asked to while it
 DELIVERY_TIMEOUT = 0.2  # s for the last messages of all nodes to be acknowledged
 
 MAKERS = {name: f"{name.title().replace('_', '')}Node" for name in ALL_NODES} | {"perception": "perception"}
-"""What each program makes and runs, by its name, in the module of that name; the console runs itself."""
+"""What each program makes and runs, by its name, in the module of that name; beside the console."""
 
 
 def main() -> int:
@@ -53,7 +53,7 @@ def main() -> int:
         except ModuleNotFoundError as error:
             print(f"error: {missing_module(error)}", file=sys.stderr)
             return 1
-        return run(getattr(module, MAKERS[name])) if name in MAKERS else int(module.main())
+        return run(getattr(module, MAKERS.get(name, "ConsoleNode")))
     finally:
         for which in STOPS:
             signal.signal(which, signal.SIG_IGN)
@@ -133,7 +133,7 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
-        executor.spin_until(lambda: is_ending.is_set() or all(node.has_ended for node in nodes))
+        nodes[0].spin(executor, lambda: is_ending.is_set() or all(node.has_ended for node in nodes))
         _finish(nodes)
     except ExternalShutdownException:  # something else in this process has shut the context down
         return 0
