@@ -24,6 +24,7 @@ from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
@@ -168,11 +169,12 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self._reactivate = True
             self.trigger_deactivate()
 
-    def own_process(self) -> None:
-        """Set the real-time priority of the loop."""
+    def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
+        """Do the work of this node at the real-time priority of its loop."""
         scheduling = raise_priority((self.settings or CoilBridgeSettings()).realtime_priority)
         self.health.note(**{SCHEDULING: scheduling})
         self.get_logger().info(f"{SCHEDULING}: {scheduling}")
+        super().spin(executor, is_over)
 
     def refuse(self, problem: Exception) -> None:
         """Count and report a message that was refused."""

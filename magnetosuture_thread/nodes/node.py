@@ -198,9 +198,6 @@ class GuardedNode(Node):
         """Whether the node was shut down for good, so that its process can end."""
         return False
 
-    def own_process(self) -> None:
-        """Do what concerns the whole process, where the node is alone in it."""
-
     def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
         """Do the work of this node, and of all others in its executor, until it is over."""
         executor.spin_until(is_over)

@@ -125,8 +125,6 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
         made = make()
         nodes = made if isinstance(made, tuple) else (made,)
-        if len(nodes) == 1:
-            nodes[0].own_process()
         executor = KeptWaitSetExecutor()
         for node in nodes:
             executor.add_node(node)
