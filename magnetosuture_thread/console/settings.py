@@ -49,7 +49,7 @@ class ConsoleSettings(shared.SceneName, shared.NeedleArc):
     def check(self) -> None:
         """Reject what does not fit.
 
-        A public page without a token, a key without a certificate, an origin that is none, a speed above the maximum,
+        A public page without a token, a key without a certificate, an origin that is not valid, a speed above the maximum,
         and a short timeout.
         """
         is_token = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable() and " " not in self.token

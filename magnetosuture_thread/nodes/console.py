@@ -333,7 +333,7 @@ def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
     """Return the needle's tail [m], the angle of its heading there [rad], and whether that is not the opposite one.
 
     Raises:
-        InvalidInputError: the pose is none in the dish plane.
+        InvalidInputError: it is not a valid pose in the dish plane.
     """
     pose = needle_pose(message, directed=False)
     return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading), "directed": heading_known(message)}
@@ -391,7 +391,7 @@ def estimated(message: msg.EstimatedThread) -> dict[str, Any]:
 
 def _disturbance(message: msg.ThreadDisturbance) -> dict[str, Any]:
     direction = [message.direction.x, message.direction.y]
-    text = disturbance_text(message.arc_length, message.force, (direction[0], direction[1]))
+    text = disturbance_text(message.arc_length, message.force, direction)
     position = [message.position.x, message.position.y]
     return {"position": position, "direction": direction, "force": message.force, "text": text}
 

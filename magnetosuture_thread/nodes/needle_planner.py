@@ -181,12 +181,10 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
 
     def on_estimate(self, message: msg.EstimatedThread) -> None:
         """Register how sure the estimate is, and which forces the model does not know of."""
-        disturbances = {
-            reading.seconds(force.since): disturbance_text(
-                force.arc_length, force.force, (force.direction.x, force.direction.y)
-            )
-            for force in message.disturbances[:20]
-        }
+        disturbances = {}
+        for force in message.disturbances[:20]:
+            text = disturbance_text(force.arc_length, force.force, (force.direction.x, force.direction.y))
+            disturbances[reading.seconds(force.since)] = text
         now, unmeasured = time.monotonic(), message.unmeasured_for
         self._session.known.on_estimate(now, unmeasured, disturbances, lambda: _vertices(message))
 
