@@ -11,7 +11,7 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
@@ -29,7 +29,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
-from typing_extensions import Self
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reading import constant_name
@@ -54,7 +53,7 @@ ACTIONS: dict[str, tuple[Service, Any]] = {
 CHANGE_STATE = "coil_bridge/change_state"
 
 
-class Participant:
+class Participant(ExitStack):
     """A node in a graph, in a context of its own, until it is closed; a context manager too.
 
     Args:
@@ -65,38 +64,25 @@ class Participant:
 
     Attributes:
         node: as made.
+        spin_some: takes what has come.
     """
 
     def __init__(
         self, name: str, *, domain: int | None = None, namespace: str = "", simulated_clock: bool = False
     ) -> None:
-        self._context = Context()
-        no_handlers = SignalHandlerOptions.NO
-        rclpy.init(context=self._context, domain_id=domain, args=[], signal_handler_options=no_handlers)
+        super().__init__()
+        context, no_handlers = Context(), SignalHandlerOptions.NO
+        rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=no_handlers)
+        self.callback(context.try_shutdown)
         values = {"start_type_description_service": False, "use_sim_time": simulated_clock}
         parameters = [Parameter(key, value=value) for key, value in values.items()]
         options: dict[str, Any] = {"parameter_overrides": parameters, "start_parameter_services": False}
-        self.node = GuardedNode(name, context=self._context, namespace=namespace, **options)
-        self._executor = KeptWaitSetExecutor(context=self._context)
-        self._executor.add_node(self.node)
-
-    def __enter__(self) -> Self:
-        """Return this."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Leave the graph."""
-        self.close()
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
-    def spin_some(self) -> None:
-        """Take what has come."""
-        self._executor.spin_some()
+        self.node = GuardedNode(name, context=context, namespace=namespace, **options)
+        self.callback(self.node.destroy_node)
+        executor = KeptWaitSetExecutor(context=context)
+        self.callback(executor.shutdown)
+        executor.add_node(self.node)
+        self.spin_some = executor.spin_some
 
 
 def listen(

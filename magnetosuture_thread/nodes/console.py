@@ -41,7 +41,6 @@ from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError, shortened
 from magnetosuture_thread.settings.files import shipped_names
-from magnetosuture_thread.settings.interface import Service
 from magnetosuture_thread.thread.margins import node_clearance
 from magnetosuture_thread.vision.images import image_of
 
@@ -52,6 +51,7 @@ MAX_NODES = 32  # shown
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
 MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
 
+PAUSES = (interface.Service.PAUSE_REPLAY, interface.Service.PAUSE_RIG)
 RECORDED_TOPICS = tuple(
     dict.fromkeys((*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *topics.PROCEDURES))
 )
@@ -80,7 +80,7 @@ class ConsoleGraph:
         self.node = node
         self.blocked = ""
         offered_by = ("coil_bridge", interface.PLANNER, "replay", RIG)
-        self.services = Services(node, {name: name.type_name for name in Service if name.node in offered_by})
+        self.services = Services(node, {name: name.type_name for name in interface.Service if name.node in offered_by})
         self._action = 0  # number of the latest
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
@@ -125,7 +125,7 @@ class ConsoleGraph:
             return await self.call(interface.SERVICES[f"procedure/{action}"], Trigger.Request())
         request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
         # A long way takes some seconds, and is planned once.
-        return await self.call(Service.PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)
+        return await self.call(interface.Service.PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)
 
     async def execute_action(self, action: str) -> str:
         """Arm, disarm, stop or reset; return an empty text, or the reason of a refusal.
@@ -151,7 +151,7 @@ class ConsoleGraph:
         text = shortened(str(answer.message), MAX_REASON_CHARS)
         if not answer.success:
             return text or "refused"
-        return "" if name in (Service.PAUSE_REPLAY, Service.PAUSE_RIG) else text  # that time is paused is no remark
+        return "" if name in PAUSES else text  # that time is paused is no remark
 
     def state(self) -> dict[str, Any]:
         """Return the present state; see `console.client.Graph`."""
@@ -300,8 +300,7 @@ class GraphHost:
 
     def _pause_service(self) -> str:
         """Return the service that pauses time; empty if there is none."""
-        pauses = (Service.PAUSE_REPLAY, Service.PAUSE_RIG)
-        return next((name for name in pauses if self.graph.services.ready(name)), "")
+        return next((name for name in PAUSES if self.graph.services.ready(name)), "")
 
 
 class ConsoleNode(GuardedNode):

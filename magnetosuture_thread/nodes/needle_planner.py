@@ -35,7 +35,6 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import shortened
-from magnetosuture_thread.settings.interface import Service
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
 
@@ -79,11 +78,11 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
         self._read_sparingly(topics.PREDICTED_THREAD, self.on_prediction)
         self._read_sparingly(topics.ESTIMATED_THREAD, self.on_estimate)
         self._read_sparingly(topics.MARGINS, self.on_margins)
-        self.serve(Service.PLAN_PROCEDURE, self.on_plan)
+        self.serve(interface.Service.PLAN_PROCEDURE, self.on_plan)
         for service, execute in (
-            (Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person")),
-            (Service.RESUME_PROCEDURE, self.resume_procedure),
-            (Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person")),
+            (interface.Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person")),
+            (interface.Service.RESUME_PROCEDURE, self.resume_procedure),
+            (interface.Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person")),
         ):
             self.serve(service, partial(self._serve, execute))
         self._action = ProcedureAction(self)
