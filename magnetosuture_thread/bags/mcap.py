@@ -21,15 +21,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
-from mcap import records as mcap_records
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Channel, DataEnd, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
 from magnetosuture_thread.bags.storage import (
@@ -50,19 +51,13 @@ from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
-MAX_DEFINITION_BYTES = 1 << 22  # of a record that is neither a message nor a chunk; in memory it takes 20 times as much
 _RECORD = struct.Struct("<BQ")  # opcode and length of the content
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
-_CHUNK_HEAD_BYTES = 40  # of its content: times, size, checksum, lengths of the compression's name and of the records
 _MIN_PRIVATE_OPCODE = 0x80
-_UNREAD = (Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT)
-_WINDOW_BYTES = 1 << 22  # searched or read at a time
-_RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
-_RECORD_COST = 5  # of a record outside of chunks, which takes the time of so many within
+_MAX_DEFINITION_BYTES = _WINDOW_BYTES = 1 << 22  # of a record that is no message or chunk; searched or read at a time
 # A chunk: opcode, length of less than a terabyte, times, size and checksum, a known compression; or the data's end.
 _CHUNK = rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
 _CHUNK_OR_END = re.compile(_CHUNK + rb"|\x0f\x04\0{7}.{4}[\x02-\x04\x08\x0a\x0b\x0d].{5}\0{3}", re.DOTALL)
-_PATTERN_BYTES = 64  # more than a match
 _lz4: Any = import_module("lz4.frame")  # which has no types
 
 
@@ -70,13 +65,15 @@ class CorruptError(Exception):
     """Bytes that are no valid record; the text gives the reason."""
 
 
-def split_records(read: Callable[[int, int], bytes], position: int, size: int) -> Iterator[tuple[int, int, int, bytes]]:
+def split_records(
+    read: Callable[[int, int], bytes], size: int, position: int = 0
+) -> Iterator[tuple[int, int, int, bytes]]:
     """Yield opcode, start and end of each record from a position on, and its first bytes.
 
     Args:
         read: returns the bytes from a position to another.
-        position: where the first record begins.
-        size: where the last one ends.
+        size: where the last record ends.
+        position: where the first one begins.
 
     Raises:
         CorruptError: a record is longer than the rest or than it may be, or none.
@@ -94,7 +91,7 @@ def split_records(read: Callable[[int, int], bytes], position: int, size: int) -
         elif opcode == Opcode.ATTACHMENT or opcode >= _MIN_PRIVATE_OPCODE:
             is_odd = False
         else:
-            most = MAX_RECORD_BYTES if opcode == Opcode.CHUNK else MAX_DEFINITION_BYTES
+            most = MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _MAX_DEFINITION_BYTES
             is_odd = not Opcode.HEADER <= opcode <= Opcode.DATA_END or length > most
         if is_odd:
             raise CorruptError("no record where one is expected")
@@ -134,8 +131,8 @@ def unpack_chunk(record: bytes, budget: Budget | None = None) -> tuple[bytes, bo
     """
     chunk = parse_record(record)
     size, data = chunk.uncompressed_size, chunk.data
-    begin = _RECORD.size + _CHUNK_HEAD_BYTES + len(chunk.compression)
-    # The package reads what there is.
+    # Behind times, size, checksum, the compression's name and the length of the records; the package reads what is there.
+    begin = _RECORD.size + 40 + len(chunk.compression)
     if size > MAX_RECORD_BYTES or record[begin - 8 : begin] != (len(record) - begin).to_bytes(8, "little"):
         raise CorruptError(f"a chunk of {size} bytes, or of a wrong length")
     if budget is not None:
@@ -187,10 +184,10 @@ class Block:
 
 def connections_of(definitions: Iterable[Any]) -> dict[int, Connection]:
     """Return the channels whose definition, and that of their schema, is without conflict."""
-    schemas: dict[int, Any] = {0: mcap_records.Schema(0, b"", "", "")}
+    schemas: dict[int, Any] = {0: Schema(0, b"", "", "")}
     channels: dict[int, Any] = {}
     for record in definitions:
-        table = schemas if isinstance(record, mcap_records.Schema) else channels
+        table = schemas if isinstance(record, Schema) else channels
         if table.setdefault(record.id, record) != record:
             table[record.id] = None
     known: dict[int, Connection] = {}
@@ -234,22 +231,23 @@ class McapFile:
         self.path = path
         self.damage: DamageReport | None = None
         self.others: Counter[str] = Counter()
+        self.connections: dict[int, Connection] = {}
+        self.counts: Counter[int] = Counter()
         self._budget = budget
         self._blocks: list[Block] = []
         self._regions: list[CorruptRegion] = []
-        self._definitions: dict[bytes, Any] = {}  # by the bytes of their records, of chunks with a checksum
-        self._loose_definitions: list[Any] = []
-        self._metadata: list[mcap_records.Metadata] = []
+        # By the bytes of their records: of chunks with a checksum, of other data, of the summary.
+        self._definitions: dict[bytes, Any] = {}
+        self._loose_definitions: dict[bytes, Any] = {}
+        self._summary_definitions: dict[bytes, Any] = {}
+        self._metadata: list[Metadata] = []
+        self._statistics: Statistics | None = None
         self._data_end = self._data_crc = 0  # where the data section ends, 0 where that is not known; its checksum
-        self._is_verified = False  # by the latter
-        self._summary_definitions: list[Any] = []
-        self._statistics: mcap_records.Statistics | None = None
-        self._has_footer = self._is_trusted = False  # the latter: the summary, by its checksum
+        self._is_verified = self._is_trusted = False  # the data by its checksum; the summary by its own
         try:
             with open_file(path) as stream:
                 size = stream.seek(0, 2)
-                stream.seek(0)
-                head = stream.read(HEAD_BYTES)
+                head = read_range(stream, 0, HEAD_BYTES)
                 if not size:
                     raise BagError(path, "is empty, expected an mcap file")
                 is_indexed = is_url(path) and self._read_index(stream, size)
@@ -289,7 +287,7 @@ class McapFile:
         try:
             with open_file(self.path) as stream:
                 yield from merge_by_time(
-                    (block.start, partial(self._read_block, stream, block, wanted, start, end))
+                    (block.start, self._read_block(stream, block, wanted, start, end))
                     for block in self._blocks
                     if block.start <= end and block.end >= start and not wanted.isdisjoint(block.counts)
                 )
@@ -306,7 +304,7 @@ class McapFile:
                 data, has_checksum = unpack_chunk(data)
                 if (block.crc is None and not has_checksum) or block.crc not in (None, zlib.crc32(data)):
                     raise CorruptError("a chunk without a checksum, or other bytes than before")
-            for opcode, first, last, head in split_records(lambda start, end: data[start:end], 0, len(data)):
+            for opcode, first, last, head in split_records(lambda start, end: data[start:end], len(data)):
                 if opcode == Opcode.MESSAGE:
                     channel, sequence, time, publish_time = _MESSAGE.unpack_from(head, _RECORD.size)
                     if channel in wanted and start <= time <= end:
@@ -325,12 +323,11 @@ class McapFile:
             summary = make_reader(stream).get_summary()
             if summary is None or summary.statistics is None:
                 return False
-            metadata = []
-            for entry in summary.metadata_indexes:
-                length = min(entry.length, MAX_DEFINITION_BYTES)
-                metadata.append(parse_record(read_range(stream, entry.offset, entry.offset + length)))
-            stream.seek(-_RECORD.size - 20 - len(MAGIC), 2)
-            footer = parse_record(stream.read())
+            metadata = [
+                parse_record(read_range(stream, entry.offset, entry.offset + min(entry.length, _MAX_DEFINITION_BYTES)))
+                for entry in summary.metadata_indexes
+            ]
+            footer = parse_record(read_range(stream, size - _RECORD.size - 20 - len(MAGIC), size))
         except (McapError, CorruptError, struct.error, ValueError):
             return False
         counts = {channel: count for channel, count in summary.statistics.channel_message_counts.items() if count}
@@ -354,79 +351,76 @@ class McapFile:
 
     def _scan(self, stream: BinaryIO, size: int, progress: Callable[[int], None]) -> None:
         """Scan the file record by record; behind corrupt bytes, from the next intact place on."""
-        stream.seek(0)
         position = sound = len(MAGIC)  # the latter: where the last intact chunk, or the data section, ends
-        if stream.read(len(MAGIC)) != MAGIC:
-            self._regions.append(CorruptRegion(self.path.name, 0, len(MAGIC), "not the first bytes of an mcap file"))
+        has_footer = False
+        if read_range(stream, 0, len(MAGIC)) != MAGIC:
+            self._add_region("not the first bytes of an mcap file", 0, len(MAGIC))
         while position < size:
             before = position
             try:
-                for opcode, start, end, head in split_records(partial(read_range, stream), position, size):
+                for opcode, start, end, head in split_records(partial(read_range, stream), size, position):
                     self._add(stream, opcode, start, end, head)
                     position = end
-                    is_sound = opcode == Opcode.DATA_END or (opcode == Opcode.CHUNK and self._blocks[-1].has_checksum)
-                    sound = end if is_sound else sound
-                    if opcode == Opcode.FOOTER:
-                        self._end(stream, start, end, size)
-                        position = size
+                    if opcode == Opcode.DATA_END or (opcode == Opcode.CHUNK and self._blocks[-1].has_checksum):
+                        sound = end
+                    elif opcode == Opcode.FOOTER:
+                        self._verify_summary(stream, start, end, size)
+                        position, has_footer = size, True
                         break
             except CorruptError as error:
                 after = self._find_intact(stream, sound, size, position)
                 start = position if after > position else sound  # A corrupt length may lead past intact chunks.
-                time = self._blocks[-1].end if self._blocks else None
-                self._regions.append(CorruptRegion(self.path.name, start, after, str(error), time))
+                self._add_region(str(error), start, after, self._blocks[-1].end if self._blocks else None)
                 position = after
             progress(max(0, position - before))
-        if not self._has_footer and not any(region.end == size for region in self._regions):
-            time = self._blocks[-1].end if self._blocks else None
-            self._regions.append(CorruptRegion(self.path.name, size, size, "it is truncated", time))
+        if not has_footer and not any(region.end == size for region in self._regions):
+            self._add_region("it is truncated", size, size, self._blocks[-1].end if self._blocks else None)
+
+    def _add_region(self, what: str, start: int, end: int, first: int | None = None) -> None:
+        self._regions.append(CorruptRegion(self.path.name, start, end, what, first))
 
     def _add(self, stream: BinaryIO, opcode: int, start: int, end: int, head: bytes) -> None:
         """Add a record of the file."""
-        # An index comes with a message of its chunk: small chunks of many topics are mostly such indexes.
-        self._budget.spend("records", _RECORD_COST)
+        # A record outside of chunks takes the time of five within. An index comes with a message of its chunk: small
+        # chunks of many topics are mostly such indexes.
+        self._budget.spend("records", 5)
         self.others["attachment"] += opcode == Opcode.ATTACHMENT
         self.others["record of a private kind"] += opcode >= _MIN_PRIVATE_OPCODE
-        if opcode in _UNREAD or opcode >= _MIN_PRIVATE_OPCODE:
-            return
         if opcode == Opcode.MESSAGE:
             run = self._blocks[-1] if self._blocks else Block(0, 0)
-            if run.is_chunk or run.offset + run.length != start or run.length > _RUN_BYTES:
+            if run.is_chunk or run.offset + run.length != start or run.length > 1 << 20:  # bytes, read at a time
                 run = Block(start, 0)
                 self._blocks.append(run)
             run.length = end - run.offset
             run.add(head)
-            return
-        record = read_range(stream, start, end)
-        if opcode == Opcode.CHUNK:
-            self._add_chunk(record, start)
-            return
-        parsed = self._parse_and_keep(record)
-        if isinstance(parsed, mcap_records.DataEnd):
-            self._data_end, self._data_crc = end, parsed.data_section_crc
-            self._is_verified = self._data_crc != 0 and _crc(stream, 0, start) == self._data_crc
-        elif isinstance(parsed, mcap_records.Metadata):
-            self._metadata.append(parsed)
-        elif isinstance(parsed, mcap_records.Statistics):
-            self._statistics = parsed
-        elif isinstance(parsed, (mcap_records.Schema, mcap_records.Channel)):
-            (self._summary_definitions if self._data_end else self._loose_definitions).append(parsed)
+        elif opcode == Opcode.CHUNK:
+            self._add_chunk(read_range(stream, start, end), start)
+        elif opcode not in (Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT) and opcode < _MIN_PRIVATE_OPCODE:
+            record = read_range(stream, start, end)
+            match self._parse_and_keep(record):
+                case DataEnd(data_section_crc=crc):
+                    self._data_end, self._data_crc = end, crc
+                    self._is_verified = crc != 0 and _crc(stream, 0, start) == crc
+                case Metadata() as metadata:
+                    self._metadata.append(metadata)
+                case Statistics() as statistics:
+                    self._statistics = statistics
+                case Schema() | Channel() as definition:
+                    definitions = self._summary_definitions if self._data_end else self._loose_definitions
+                    definitions[record] = definition
 
     def _add_chunk(self, record: bytes, position: int) -> None:
         """Add a chunk and its definitions; nothing of it where a record is corrupt."""
         data, has_checksum = unpack_chunk(record, self._budget)
         block = Block(position, len(record), True, has_checksum, zlib.crc32(data))
         definitions = {}
-        for opcode, start, end, head in split_records(lambda start, end: data[start:end], 0, len(data)):
+        for opcode, start, end, head in split_records(lambda start, end: data[start:end], len(data)):
             self._budget.spend("records", 1)
             if opcode == Opcode.MESSAGE:
                 block.add(head)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data[start:end] not in self._definitions:
                 definitions[data[start:end]] = self._parse_and_keep(data[start:end])
-        if has_checksum:
-            self._definitions |= definitions
-        else:
-            self._loose_definitions += definitions.values()
+        (self._definitions if has_checksum else self._loose_definitions).update(definitions)
         self._blocks.append(block)
 
     def _parse_and_keep(self, record: bytes) -> Any:
@@ -440,13 +434,12 @@ class McapFile:
         self._budget.spend("bytes of definitions", 2 * len(record) + 500 + 150 * len(entries))
         return parsed
 
-    def _end(self, stream: BinaryIO, start: int, end: int, size: int) -> None:
-        """Verify the summary by the footer, which is all that may be at the end of the file."""
+    def _verify_summary(self, stream: BinaryIO, start: int, end: int, size: int) -> None:
+        """Verify the summary by the footer, behind which only the magic may be."""
         footer, magic = parse_record(read_range(stream, start, end)), stream.read()
         self._is_trusted = _crc(stream, self._data_end, start + _RECORD.size + 16) == footer.summary_crc != 0
         if end != size - len(MAGIC) or magic != MAGIC or not (self._is_trusted or footer.summary_crc == 0):
             raise CorruptError("a summary or an end with a wrong checksum")
-        self._has_footer = True
 
     def _find_intact(self, stream: BinaryIO, position: int, size: int, corrupt: int) -> int:
         """Return where the next chunk with a correct checksum, or the end of the data, begins; the size if nowhere.
@@ -460,8 +453,7 @@ class McapFile:
             corrupt: where none begins.
         """
         while position < size:
-            stream.seek(position)
-            window = stream.read(_WINDOW_BYTES)
+            window = read_range(stream, position, position + _WINDOW_BYTES)
             self._budget.spend("unpacked bytes", len(window))
             for match in _CHUNK_OR_END.finditer(window):
                 at = position + match.start()
@@ -475,57 +467,65 @@ class McapFile:
                         return at
                 except CorruptError:
                     continue
-            position += max(1, len(window) - _PATTERN_BYTES)
+            position += max(1, len(window) - 64)  # more than a match
         return size
 
     def _salvage(self, size: int) -> None:
         """Keep the blocks that can be used, and set connections, counts and damage."""
-        name, statistics, regions = self.path.name, self._statistics, self._regions
+        statistics, regions = self._statistics, self._regions
         corrupt_bytes = sum(region.end - region.start for region in regions)
         is_private = self.others["record of a private kind"] > 0
         is_scanned = not is_private and self._data_end > 0 and all(r.start >= self._data_end for r in regions)
         is_scanned = is_scanned or self._is_verified
-        chunks = [block for block in self._blocks if block.is_chunk]
         # A recorder does not write the same messages with the same times again, but a copy of a part of a file does.
-        is_odd = regions or statistics is None or _contradiction(statistics, self._blocks, _count(self._blocks))
+        is_odd = regions or statistics is None or _contradiction(statistics, self._blocks)
         if is_odd and not self._is_verified:
+            chunks = [block for block in self._blocks if block.is_chunk]
             once = {(block.crc, block.start, block.end): block for block in reversed(chunks)}
             copies = [block for block in chunks if once[block.crc, block.start, block.end] is not block]
             self._blocks = [block for block in self._blocks if block not in copies]
-            regions += [_region(name, [block], "a second copy of a chunk") for block in copies]
-        scanned = _count(self._blocks)
-        if not regions and statistics is not None and (problem := _contradiction(statistics, self._blocks, scanned)):
-            regions.append(CorruptRegion(name, self._data_end, size, problem))
+            for block in copies:
+                self._add_region("a second copy of a chunk", *_extent([block]))
+        scanned = _count(self._blocks).total()
+        if not regions and statistics is not None and (problem := _contradiction(statistics, self._blocks)):
+            self._add_region(problem, self._data_end, size)
             is_scanned = False
         if not regions and self._data_crc and not self._is_verified:
-            regions.append(CorruptRegion(name, 0, size, "data other than messages does not match its checksum"))
+            self._add_region("data other than messages does not match its checksum", 0, size)
         if not regions and statistics is None and not self._is_verified and is_private:
-            regions.append(CorruptRegion(name, 0, size, "records of a private kind, which may be corrupt others"))
+            self._add_region("records of a private kind, which may be corrupt others", 0, size)
         is_sound = self._is_verified or not regions
         loose = [block for block in self._blocks if not block.has_checksum]
         if loose and not is_sound:
             self._blocks = [block for block in self._blocks if block.has_checksum]
-            what = f"{pluralize(_count(loose).total(), 'message')} without a checksum, which may be wrong"
-            regions.append(_region(name, loose, what))
-        definitions = [*self._definitions.values(), *(self._loose_definitions if is_sound else ())]
-        self.connections = connections_of([*definitions, *(self._summary_definitions if self._is_trusted else ())])
+            count = pluralize(_count(loose).total(), "message")
+            self._add_region(f"{count} without a checksum, which may be wrong", *_extent(loose))
+        loose_definitions = self._loose_definitions if is_sound else {}
+        summary_definitions = self._summary_definitions if self._is_trusted else {}
+        definitions = self._definitions, loose_definitions, summary_definitions
+        self.connections = connections_of(chain.from_iterable(table.values() for table in definitions))
         self.counts = _count(self._blocks)
         for channel in sorted(self.counts.keys() - self.connections.keys()):
             block = next(block for block in self._blocks if channel in block.counts)
-            what = f"{pluralize(self.counts.pop(channel), 'message')} of a channel without a definition, or with two"
-            regions.append(_region(name, [block], what))
-        if not regions:
-            return
-        used, lost = self.counts.total(), scanned.total() - self.counts.total() if is_scanned else None
-        lost_chunks = sum("chunk" in region.what for region in regions)
+            count = pluralize(self.counts.pop(channel), "message")
+            self._add_region(f"{count} of a channel without a definition, or with two", *_extent([block]))
+        if regions:
+            self._report_damage(corrupt_bytes, scanned if is_scanned else None)
+
+    def _report_damage(self, corrupt_bytes: int, scanned: int | None) -> None:
+        """Set the damage by what the summary claims, else by the number of messages that were scanned, if it is known."""
+        used, statistics = self.counts.total(), self._statistics
+        lost = None if scanned is None else scanned - used
+        lost_chunks = sum("chunk" in region.what for region in self._regions)
         if statistics is not None and self._is_trusted:
             lost = max(0, statistics.message_count - used)
             lost_chunks = max(0, statistics.chunk_count - sum(block.is_chunk for block in self._blocks))
-        for number, region in enumerate(regions):
+        regions = []
+        for region in sorted(self._regions, key=lambda region: region.start):
             following = next((block.start for block in self._blocks if block.offset >= region.end), None)
-            times = (None, None) if lost == 0 else (region.first, following)
-            regions[number] = replace(region, first=times[0], last=times[1])
-        self.damage = DamageReport(tuple(sorted(regions, key=lambda r: r.start)), lost_chunks, corrupt_bytes, lost)
+            first, last = (None, None) if lost == 0 else (region.first, following)
+            regions.append(replace(region, first=first, last=last))
+        self.damage = DamageReport(tuple(regions), lost_chunks, corrupt_bytes, lost)
 
 
 def _count(blocks: Iterable[Block]) -> Counter[int]:
@@ -536,9 +536,9 @@ def _count(blocks: Iterable[Block]) -> Counter[int]:
     return counts
 
 
-def _region(name: str, blocks: list[Block], what: str) -> CorruptRegion:
-    """Return the region from the first of some blocks to the last."""
-    return CorruptRegion(name, blocks[0].offset, blocks[-1].offset + blocks[-1].length, what)
+def _extent(blocks: list[Block]) -> tuple[int, int]:
+    """Return where the first of some blocks begins in the file, and where the last one ends."""
+    return blocks[0].offset, blocks[-1].offset + blocks[-1].length
 
 
 def _crc(stream: BinaryIO, start: int, end: int) -> int:
@@ -550,8 +550,9 @@ def _crc(stream: BinaryIO, start: int, end: int) -> int:
     return crc
 
 
-def _contradiction(statistics: mcap_records.Statistics, blocks: list[Block], counts: Counter[int]) -> str:
+def _contradiction(statistics: Statistics, blocks: list[Block]) -> str:
     """Return how a summary contradicts the messages; empty if it does not."""
+    counts = _count(blocks)
     start = min((block.start for block in blocks if block.counts), default=0)
     end = max((block.end for block in blocks if block.counts), default=statistics.message_end_time)
     is_same = statistics.message_count == counts.total()

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -44,12 +43,6 @@ _TABLES = {
     "messages": {"id", "topic_id", "timestamp", "data"},
     "message_definitions": set[str](),
 }
-# sqlite3 does not enforce column types, so that a row may hold anything.
-_COUNT = """
-    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)),
-    SUM(typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob')
-    FROM messages GROUP BY topic_id
-"""
 
 
 class SqliteFile:
@@ -66,9 +59,9 @@ class SqliteFile:
     """
 
     def __init__(self, path: Path, progress: Callable[[int], None] = lambda count: None) -> None:
-        self.path = path
         if is_url(path):
             raise BagError(path, "is a database, which is read on its own machine only; copy it to this machine")
+        self.path = path
         self.notes: dict[str, str] = {}
         self.has_no_checksum = "has no checksums (sqlite3): damage to it cannot be noticed"
         self.others: Counter[str] = Counter()
@@ -123,8 +116,14 @@ class SqliteFile:
             raise BagError(self.path, f"has no column {problem} in its table {table}, or one that is computed")
 
     def _count_messages(self, database: sqlite3.Connection) -> None:
+        """Set counts and times, or refuse a row that has no valid ones: sqlite3 does not enforce column types."""
+        query = """
+            SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM(typeof(topic_id) = 'integer'
+            AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob')
+            FROM messages GROUP BY topic_id
+        """
         times: list[int] = []
-        for topic, count, first, last, longest, valid in database.execute(_COUNT):
+        for topic, count, first, last, longest, valid in database.execute(query):
             if topic not in self.connections or valid < count:
                 raise sqlite3.DatabaseError(f"{count} rows of which some have no valid time, topic or data")
             if longest > MAX_RECORD_BYTES:
@@ -166,10 +165,9 @@ def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
         for row in rows
     }
     connections = {}
-    for row in database.execute("SELECT * FROM topics"):
-        entries = dict(row)
+    for row in map(dict[str, Any], database.execute("SELECT * FROM topics")):
         definition = definitions.get(row["type"]) or MessageDefinition(row["type"])
-        metadata = {QOS: entries.get("offered_qos_profiles"), TYPE_HASH: entries.get("type_description_hash")}
+        metadata = {QOS: row.get("offered_qos_profiles"), TYPE_HASH: row.get("type_description_hash")}
         texts = {key: text for key, text in metadata.items() if isinstance(text, str)}
         named = (row["name"], definition.type_name, definition.encoding, definition.text, row["serialization_format"])
         if isinstance(row["id"], int) and all(isinstance(text, str) for text in named):
@@ -180,7 +178,6 @@ def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
 
 Progress = Callable[[float], None]
 BagStorage = McapFile | SqliteFile
-_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
 _OWN_DECODERS = DecoderCache(Budget("messages", 0))  # of messages of no bag
 
 
@@ -257,22 +254,22 @@ class Bag:
         self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda fraction: None
     ) -> None:
         self.path = path
-        found = find_bag_files(path)
-        budget = Budget(path, sum(_file_size(file) for file in found.files))
+        files = find_bag_files(path)
+        budget = Budget(path, sum(_file_size(file) for file in files.files))
         self.decoders = DecoderCache(budget)
-        self._storages, problems = _open(found.files, budget, progress)
-        lost = [DamageReport((region,), 0, region.end, None) for region in (*found.lost, *problems)]
+        self._storages, problems = _open(files.files, budget, progress)
+        lost = [DamageReport((region,), 0, region.end, None) for region in (*files.lost, *problems)]
         self.damage = merge_reports([*(storage.damage for storage in self._storages), *lost])
-        self.remarks, self.custom_data = found.remarks, found.custom_data
+        self.remarks, self.custom_data = files.remarks, files.custom_data
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
         self.others = sum((storage.others for storage in self._storages), Counter[str]())
-        self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
+        self.notes = next((storage.notes for storage in self._storages if storage.notes), files.notes)
         self.salvaged_without_checksum = self.notes.get(SALVAGED_NOTE, "")
         doubt = next((storage.has_no_checksum for storage in self._storages if storage.has_no_checksum), "")
         self.has_no_checksum = doubt or self.notes.get(NO_CHECKSUM_NOTE, "")
-        if not any(storage.counts for storage in self._storages):
-            raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         filled = [storage for storage in self._storages if storage.counts]
+        if not filled:
+            raise BagError(files.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         self.start = min(storage.start for storage in filled)
         self.end = max(storage.end for storage in filled)
         self.duration = (self.end - self.start) * 1e-9
@@ -281,11 +278,11 @@ class Bag:
         types: dict[str, dict[str, None]] = {}
         for storage in self._storages:
             for number, connection in storage.connections.items():
-                name, count = self._names[connection.topic], storage.counts.get(number, 0)
-                self.counts[name] += count
+                name = self._names[connection.topic]
+                self.counts[name] += storage.counts.get(number, 0)
                 types.setdefault(name, {})[connection.type_name] = None
-        self.topics = {name: next(iter(own)) for name, own in types.items() if len(own) == 1}
-        self.conflicts = {name: tuple(own) for name, own in types.items() if len(own) > 1}
+        self.topics = {name: next(iter(kinds)) for name, kinds in types.items() if len(kinds) == 1}
+        self.conflicts = {name: tuple(kinds) for name, kinds in types.items() if len(kinds) > 1}
 
     def records(
         self,
@@ -324,7 +321,8 @@ class Bag:
         Raises:
             BagError: it cannot be unpacked.
         """
-        if item.connection.serialization != CDR or not item.data.startswith(_ZSTD):
+        # No CDR message begins as one of zstd does: its first byte is 0.
+        if item.connection.serialization != CDR or not item.data.startswith(b"\x28\xb5\x2f\xfd"):
             return item.data
         topic = self._names[item.connection.topic]
         try:
@@ -380,10 +378,10 @@ class Bag:
         first = self.start + round(start * 1e9)
         last = self.end if duration is None else first + round(duration * 1e9)
         parts = []
-        for storage in sorted(self._storages, key=lambda storage: storage.start):
+        for storage in self._storages:
             wanted = [number for number, c in storage.connections.items() if self._names[c.topic] in topics]
             if wanted:
-                parts.append((storage.start, partial(storage.messages, wanted, first, last)))
+                parts.append((storage.start, storage.messages(wanted, first, last)))
         return merge_by_time(parts)
 
 
