@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.cdr import Stamp, pack
-from magnetosuture_thread.bags.packing import forecast_instants, time_or_nan
+from magnetosuture_thread.bags.packing import Stamp, forecast_instants, pack, time_or_nan
 from magnetosuture_thread.geometry.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
 from magnetosuture_thread.geometry.polyline import Points
@@ -20,10 +19,9 @@ from magnetosuture_thread.thread.margins import UNKNOWN, Margins, friction_colou
 from magnetosuture_thread.thread.prediction import Prediction
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
+    from magnetosuture_thread.estimator import ThreadEstimate
     from magnetosuture_thread.forecast import Forecast
 
-ADD, LINE_STRIP = 0, 4  # as in Marker.msg; the other types below
 LIFETIME = 500_000_000  # ns of a text, an arrow or a forecast; poses come far more often
 
 Colour = tuple[float, ...]
@@ -42,7 +40,7 @@ COLOURS: dict[str, Colour] = {
 
 
 class MarkerType(IntEnum):
-    """As in Marker.msg."""
+    """Types of markers, as in Marker.msg."""
 
     ARROW = 0
     CYLINDER = 3
@@ -65,11 +63,11 @@ class Marker(NamedTuple):
     points: Points = np.empty((0, 2))
     caption: str = ""
     lifetime: int = 0  # ns; 0 for ever
-    action: int = ADD
+    action: int = 0  # as in Marker.msg: add
 
 
 def _line(name: str, number: int, width: float, colour: Colour, points: Points, opacity: float = 1.0) -> Marker:
-    return Marker(name, number, LINE_STRIP, (width, 0.0, 0.0), colour, opacity, points=points)
+    return Marker(name, number, MarkerType.LINE_STRIP, (width, 0.0, 0.0), colour, opacity, points=points)
 
 
 def _triangles(name: str, number: int, colour: Colour, corners: Points, opacity: float) -> Marker:
@@ -91,11 +89,11 @@ _MARKER = (
 def packed_markers(stamp: Stamp, markers: Sequence[Marker]) -> bytes:
     """Return a MarkerArray."""
     values: list[object] = []
-    for each in markers:
-        pose = (*(*each.place, 0.0)[:3], 0.0, 0.0, 0.0, 1.0)
-        values += [stamp, each.namespace, each.number, each.kind, each.action, pose, each.scale]
-        values += [(*each.colour, each.opacity), *divmod(each.lifetime, 10**9), False, each.points]
-        values += [0, "", 0, "", "", 0, 0, each.caption, "", "", 0, False]
+    for marker in markers:
+        pose = (*(*marker.place, 0.0)[:3], 0.0, 0.0, 0.0, 1.0)
+        values += [stamp, marker.namespace, marker.number, marker.kind, marker.action, pose, marker.scale]
+        values += [(*marker.colour, marker.opacity), *divmod(marker.lifetime, 10**9), False, marker.points]
+        values += [0, "", 0, "", "", 0, 0, marker.caption, "", "", 0, False]
     return pack("uint32 " + _MARKER * len(markers), len(markers), *values)
 
 
@@ -132,14 +130,12 @@ def packed_thread_markers(
     width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
     friction = UNKNOWN if margins is None else margins.friction
     colour, nodes = friction_colour(friction), thread.positions
-    spheres = (2.0 * width, 2.0 * width, 2.0 * width)
-    markers = [
-        _line("thread", 0, width, colour, nodes),
-        Marker("thread", 1, MarkerType.SPHERE_LIST, spheres, colour, points=nodes[list(friction.nodes)]),
-    ]
+    spheres, squeezed = (2.0 * width,) * 3, nodes[list(friction.nodes)]
+    markers = [_line("thread", 0, width, colour, nodes)]
+    markers.append(Marker("thread", 1, MarkerType.SPHERE_LIST, spheres, colour, points=squeezed))
     of_segments = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
-    shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in of_segments]
-    for number, minimum in enumerate(shown):
+    minima = [] if margins is None else [minimum for minimum in margins.minima if minimum.barrier not in of_segments]
+    for number, minimum in enumerate(minima):
         clearance = minimum.minimum_clearance
         x, y = nodes[minimum.node[0]]
         place = (x, y + (number + 1) * 1e-3)  # several may be closest at the same node
@@ -149,20 +145,13 @@ def packed_thread_markers(
         markers.append(_triangles("deviation", 0, COLOURS["deviation"], deviation_band(estimate), 0.35))
         if prediction is not None:
             markers.append(_line("predicted", 0, 0.4 * width, COLOURS["predicted"], prediction.positions, 0.9))
-        for number, found in enumerate(estimate.disturbances):
-            markers += _disturbance_markers(number, found, 0.4 * width)
+        for number, force in enumerate(estimate.disturbances):  # an arrow of 2.5 mm whose head is where the force acts
+            arrow = np.array([force.position - 2.5e-3 * force.direction, force.position])
+            scale, place = (0.4 * width, 1.6 * width, 1.6 * width), force.position - 3.25e-3 * force.direction
+            name, colour = "disturbances", COLOURS["alarm"]
+            head = Marker(name, 2 * number, MarkerType.ARROW, scale, colour, points=arrow, lifetime=LIFETIME)
+            markers += [head, _text(name, 2 * number + 1, "alarm", place, str(force))]
     return packed_markers(stamp, markers)
-
-
-def _disturbance_markers(number: int, found: Disturbance, width: float) -> list[Marker]:
-    """Return an arrow of 2.5 mm whose head is where the force acts, and its text."""
-    arrow = np.array([found.position - 2.5e-3 * found.direction, found.position])
-    scale, place = (width, 4.0 * width, 4.0 * width), found.position - 3.25e-3 * found.direction
-    name, colour = "disturbances", COLOURS["alarm"]
-    return [
-        Marker(name, 2 * number, MarkerType.ARROW, scale, colour, points=arrow, lifetime=LIFETIME),
-        _text(name, 2 * number + 1, "alarm", place, str(found)),
-    ]
 
 
 def deviation_band(estimate: ThreadEstimate) -> Points:

@@ -131,7 +131,7 @@ def unpack_chunk(record: bytes, budget: Budget | None = None) -> tuple[bytes, bo
     """
     chunk = parse_record(record)
     size, data = chunk.uncompressed_size, chunk.data
-    # Behind times, size, checksum, the compression's name and the length of the records; the package reads what is there.
+    # Behind times, size, checksum, compression and length of the records; the package reads what there is.
     begin = _RECORD.size + 40 + len(chunk.compression)
     if size > MAX_RECORD_BYTES or record[begin - 8 : begin] != (len(record) - begin).to_bytes(8, "little"):
         raise CorruptError(f"a chunk of {size} bytes, or of a wrong length")
@@ -513,7 +513,7 @@ class McapFile:
             self._report_damage(corrupt_bytes, scanned if is_scanned else None)
 
     def _report_damage(self, corrupt_bytes: int, scanned: int | None) -> None:
-        """Set the damage by what the summary claims, else by the number of messages that were scanned, if it is known."""
+        """Set the damage: what the summary claims and is not used, else what was scanned and is not."""
         used, statistics = self.counts.total(), self._statistics
         lost = None if scanned is None else scanned - used
         lost_chunks = sum("chunk" in region.what for region in self._regions)

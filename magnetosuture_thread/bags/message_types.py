@@ -22,9 +22,6 @@ from magnetosuture_thread.settings.files import share_directory
 
 Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 
-HEADER = "std_msgs/msg/Header"
-MAX_DEFINITION_CHARS = 200_000
-MAX_NESTING = 32  # of message types in each other
 MAX_ELEMENTS = 4_000  # fields that a message has whatever its data, all nested ones counted: a decoder is made for each
 MAX_DECODED = 1_000_000  # objects that the data of one message may become
 
@@ -102,7 +99,8 @@ class MessageDecoder:
     def has_header(self) -> bool:
         """Return whether a message is a header or begins with one."""
         fields = self._store.fielddefs[self.type_name][1] if self.is_known else []
-        return self.type_name == HEADER or (bool(fields) and fields[0][1][1] == HEADER)
+        header = "std_msgs/msg/Header"
+        return self.type_name == header or (bool(fields) and fields[0][1][1] == header)
 
 
 class DecoderCache:
@@ -164,8 +162,8 @@ def _parsed_types(definition: MessageDefinition, budget: Budget) -> Types:
     ours = typestore().fielddefs
     if definition.encoding not in ("ros2msg", "ros2idl") or (not text.strip() and name in ours):
         return {}
-    if len(text) > MAX_DEFINITION_CHARS:
-        raise BagError(name, f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
+    if len(text) > 200_000:
+        raise BagError(name, f"a definition of {len(text)} characters; at most 200000 are read")
     try:
         is_msg = definition.encoding == "ros2msg"
         parser = _BoundedMsgParser(f"MSG: {name}\n{text}") if is_msg else _BoundedIdlParser(text)
@@ -211,8 +209,8 @@ def _extent(kind: Any, types: Types, depth: int = 0) -> tuple[int, int, float]:
     if node is Nodetype.BASE:
         size = 4 if detail[0] == "string" else 1
     elif node is Nodetype.NAME:
-        if depth > MAX_NESTING:
-            raise BagError(detail, f"a definition with types more than {MAX_NESTING} deep in each other")
+        if depth > 32:
+            raise BagError(detail, "a definition with types more than 32 deep in each other")
         parts = [_extent(inner, types, depth + 1) for _, inner in types[detail][1]]
         objects, size = 1 + sum(part[0] for part in parts), sum(part[1] for part in parts)
         density = max((part[2] for part in parts), default=0.0)

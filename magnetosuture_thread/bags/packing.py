@@ -1,4 +1,4 @@
-"""Packs the messages of the graph as CDR bytes, which nodes publish and bags store as they are.
+"""Packs the messages of the graph as CDR bytes, field by field, which nodes publish and bags store as they are.
 
 Each layout has the fields of the message's definition in their order; stamps are nanoseconds or time messages.
 """
@@ -6,16 +6,19 @@ Each layout has the fields of the message's definition in their order; stamps ar
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magnetosuture_thread.bags.cdr import BEGIN, DISH_END, Stamp, aligned, pack
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.thread.margins import UNKNOWN, FrictionState, Margins
@@ -33,7 +36,80 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 Outputs = Iterator[tuple[interface.Channel, bytes]]
 
+Stamp = Any  # nanoseconds as int, or a time message of any library
+
 IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
+SELF_CONTACT = {None: 0, True: 1, False: 2}  # as in Scene.msg
+BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian, as every ROS 2 machine of today writes it
+_COUNT = struct.Struct("<I")
+DISH = _COUNT.pack(len(interface.DISH_FRAME.encode()) + 1) + interface.DISH_FRAME.encode() + b"\0"
+DISH_END = len(BEGIN) + 8 + len(DISH)  # where a header in the dish frame ends, behind its stamp
+
+
+def pack(layout: str, *values: Any) -> bytes:
+    """Return the CDR bytes of a message.
+
+    Args:
+        layout: the kinds of its fields in their order, with those of nested messages in their place, separated by
+            spaces. `header` is a stamp in the dish frame and `time` a stamp, both of type `Stamp`; `text` is a string;
+            numbers have their names in ROS. `float64[]` is a sequence of numbers, `float64[9]` an array, whose numbers
+            stand without a count; `points` is an array of shape (m, 2) as a sequence of points or vectors with z = 0;
+            `texts` is a sequence of strings; `raw` is bytes that are in place as they are.
+        values: of the fields.
+    """
+    data = bytearray(BEGIN)
+    for (kind, number, size), value in zip(_fields(layout), values, strict=True):
+        if kind == "number":
+            data += bytes((4 - len(data)) % size)
+            data += number.pack(value)
+        elif kind in ("header", "time"):
+            seconds = divmod(value, 10**9) if isinstance(value, int) else (value.sec, value.nanosec)
+            data += bytes(-len(data) % 4) + struct.pack("<iI", *seconds)
+            data += DISH if kind == "header" else b""
+        elif kind == "text":
+            _put_text(data, value)
+        elif kind == "texts":
+            data += bytes(-len(data) % 4) + _COUNT.pack(len(value))
+            for text in value:
+                _put_text(data, text)
+        elif kind == "raw":
+            data += value
+        else:
+            _put_numbers(data, kind, number, value)
+    return bytes(data)
+
+
+@cache
+def _fields(layout: str) -> tuple[tuple[str, Any, int], ...]:
+    """Return for each field what it is, its format or type, and its size [bytes]."""
+    fields: list[tuple[str, Any, int]] = []
+    formats = {"bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
+    for word in layout.split():
+        name, bracket, count = word.partition("[")
+        number = struct.Struct("<" + formats.get(name, "d"))
+        kind = name if name not in formats else "sequence" if count == "]" else "array" if bracket else "number"
+        fields.append((kind, number if kind == "number" else np.dtype(number.format), number.size))
+    return tuple(fields)
+
+
+def _put_text(data: bytearray, text: str) -> None:
+    content = text.encode() + b"\0"
+    data += bytes(-len(data) % 4) + _COUNT.pack(len(content)) + content
+
+
+def _put_numbers(data: bytearray, kind: str, dtype: np.dtype[Any], values: ArrayLike) -> None:
+    numbers = np.asarray(values, dtype)
+    if kind == "points":
+        numbers = np.column_stack([numbers, np.zeros(len(numbers))]) if len(numbers) else numbers
+    if kind != "array":
+        data += bytes(-len(data) % 4) + _COUNT.pack(len(numbers))
+    if numbers.size:  # an empty sequence is not aligned
+        data += bytes((4 - len(data)) % dtype.itemsize) + numbers.tobytes()
+
+
+def aligned(at: int, to: int) -> int:
+    """Return the next place of a size, which counts from behind the first four bytes."""
+    return 4 + (at - 4 + to - 1) // to * to
 
 
 def packed_header(stamp: Stamp) -> bytes:
@@ -129,6 +205,27 @@ def packed_camera_info(stamp: Stamp, size: tuple[int, int], view: DishView, dist
     return pack(layout, *head, np.zeros(5), matrix, np.eye(3), projection, np.zeros(6), False)
 
 
+def packed_scene(stamp: Stamp, scene: Scene) -> bytes:
+    """Return a scene as the CDR bytes of its message.
+
+    A shape has a sequence of none or one disc, and one of none or one polygon.
+    """
+    layout, dish = "header text float64 float64 float64 uint8 uint32", scene.dish
+    values: list[Any] = [stamp, scene.version, dish.diameter, dish.depth, dish.wall_friction]
+    values += [SELF_CONTACT[dish.self_contact], len(scene.shapes)]
+    for shape in scene.shapes:
+        geometry = shape.geometry
+        values += [shape.name, shape.kind]
+        if isinstance(geometry, Disc):
+            layout += " text text uint32 float64[3] uint32 float64"
+            values += [1, (*geometry.centre, geometry.radius), 0]
+        else:
+            layout += " text text uint32 uint32 points uint32" + " points" * len(geometry.holes) + " float64"
+            values += [0, 1, geometry.outline, len(geometry.holes), *geometry.holes]
+        values.append(shape.friction)
+    return pack(layout, *values)
+
+
 def packed_tracker_state(stamp: Stamp, track: Track, processing_time: float = 0.0) -> bytes:
     """Return what the tracker makes of a frame as a TrackerState.
 
@@ -166,7 +263,7 @@ def packed_prediction(stamp: Stamp, prediction: Prediction, material: str, *, st
         stamp: of the pose.
         prediction: the thread.
         material: its name.
-        step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
+        step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and 0.
     """
     tension, use, contact, pull = np.empty(0), np.empty(0), np.empty((0, 2)), (0.0, 0.0, 0.0, 0.0)
     states: tuple[FrictionState, ...] = ()
@@ -197,9 +294,9 @@ def packed_estimate(stamp: Stamp, estimate: ThreadEstimate) -> bytes:
     """
     square, degrees = (0.0, 0) if estimate.innovations is None else estimate.innovations.total
     disturbances: list[Any] = []
-    for found in estimate.disturbances:
-        numbers = (found.arc_length, found.extent, *found.position, 0.0, *found.direction, 0.0)
-        disturbances += [(*numbers, found.force, found.significance), round(found.since * 1e9)]
+    for force in estimate.disturbances:
+        numbers = (force.arc_length, force.extent, *force.position, 0.0, *force.direction, 0.0)
+        disturbances += [(*numbers, force.force, force.significance), round(force.since * 1e9)]
     layout = "header text points float64[] float64[] bool float64 float64 uint32 float64 uint32 uint32 "
     return pack(
         layout + "float64[10] time " * len(estimate.disturbances) + "texts bool float64",
@@ -336,36 +433,32 @@ def packed_bridge_state(stamp: Stamp, system: CoilSystem, driver: DriverState, r
 def camera_outputs(
     stamp: Stamp, jpeg: NDArray[np.uint8], size: tuple[int, int], view: DishView, height: float
 ) -> Outputs:
-    """Give a frame and the intrinsics of a camera at a height above the dish [m]; size is width and height."""
+    """Yield a frame and the intrinsics of a camera at a height above the dish [m]; size is width and height."""
     yield interface.COMPRESSED_IMAGE, packed_compressed_image(stamp, jpeg)
     yield interface.CAMERA_INFO, packed_camera_info(stamp, size, view, height)
 
 
 def thread_outputs(stamp: Stamp, observation: ThreadObservation, centreline: Points | None) -> Outputs:
-    """Give what a frame shows of the thread; the centreline from the tail on has the shape (m, 2) [m]."""
+    """Yield what a frame shows of the thread; the centreline from the tail on has the shape (m, 2) [m]."""
     yield interface.THREAD_OBSERVATION, packed_observation(stamp, observation)
     if centreline is not None and len(centreline):
         yield interface.MEASURED_THREAD, packed_path(stamp, centreline)
 
 
-def pose_outputs(
-    stamp: Stamp, tail: NDArray[np.float64], heading: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> Outputs:
-    """Give the needle's pose; see `packed_pose`."""
+def pose_outputs(stamp: Stamp, tail: Vector, heading: Vector, covariance: Vector) -> Outputs:
+    """Yield the needle's pose; see `packed_pose`."""
     yield interface.NEEDLE_POSE, packed_pose(stamp, tail, heading, covariance)
 
 
 def prediction_outputs(result: PredictionResult, material: str, step_time: float = 0.0) -> Outputs:
-    """Give the prediction of a pose, if there is one, with the time that it took [s]."""
+    """Yield the prediction of a pose, if there is one, with the time that it took [s]."""
     if result.prediction is not None:
-        yield (
-            interface.PREDICTED_THREAD,
-            packed_prediction(result.stamp, result.prediction, material, step_time=step_time),
-        )
+        packed = packed_prediction(result.stamp, result.prediction, material, step_time=step_time)
+        yield interface.PREDICTED_THREAD, packed
 
 
 def estimate_outputs(result: PredictionResult) -> Outputs:
-    """Give the estimate of a pose, if there is one, and the margins or why there are none."""
+    """Yield the estimate of a pose, if there is one, and the margins or why there are none."""
     if result.estimate is not None:
         yield interface.ESTIMATED_THREAD, packed_estimate(result.stamp, result.estimate)
     if result.estimate is not None or not result.late:

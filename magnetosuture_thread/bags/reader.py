@@ -118,8 +118,8 @@ class SqliteFile:
     def _count_messages(self, database: sqlite3.Connection) -> None:
         """Set counts and times, or refuse a row that has no valid ones: sqlite3 does not enforce column types."""
         query = """
-            SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM(typeof(topic_id) = 'integer'
-            AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob')
+            SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM(timestamp >= 0
+            AND typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob')
             FROM messages GROUP BY topic_id
         """
         times: list[int] = []

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.cdr import is_in_dish_frame, pack, stamp_and_frame
-from magnetosuture_thread.bags.markers import ADD, LINE_STRIP
+from magnetosuture_thread.bags.markers import MarkerType
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import pack
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.reading import is_in_dish_frame, stamp_and_frame
 from magnetosuture_thread.bags.storage import CDR, MAX_SILENCE
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
@@ -333,7 +334,7 @@ def _needle_pose(message: Any) -> list[list[float]]:
 
 def _marker_poses(message: Any) -> list[list[float]]:
     """Return the points of a Marker that is a line strip, as poses."""
-    if message.action != ADD or message.type != LINE_STRIP:
+    if message.action != 0 or message.type != MarkerType.LINE_STRIP:
         raise UnfitError("a marker that is no line strip being added")
     own = np.array(_pose(message.pose.position, message.pose.orientation))
     place, turn = own[:3], own[3:] if own[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation

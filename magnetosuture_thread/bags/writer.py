@@ -369,7 +369,7 @@ def write_repaired_bag(
 
 
 def _repaired_connection(bag: Bag, connection: Connection, report: RepairReport) -> Connection:
-    """Return a connection as it is written to the new bag: under its remapped name, with ours where it has no definition."""
+    """Return a connection as it is in the new bag: under its remapped name, with our definition where it has none."""
     definition = connection.definition
     if not definition.text and connection.serialization == CDR:
         ours = own_definition(definition.type_name)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.evaluation import recorded, replay
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary

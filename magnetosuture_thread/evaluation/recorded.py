@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import (
+    parse_scene_message,
     plane_point,
     pose_deviation,
     read_force,
@@ -29,7 +30,6 @@ from magnetosuture_thread.bags.reading import (
     stamp_of,
 )
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.bags.storage import SALVAGED_NOTE
 from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession

@@ -12,8 +12,7 @@ from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.bags.markers import forecast_events
-from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose
-from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose, parse_scene_message
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.settings.errors import shortened

@@ -24,9 +24,9 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.cdr import header_stamp
 from magnetosuture_thread.bags.markers import packed_forecast_markers, packed_thread_markers
 from magnetosuture_thread.bags.packing import estimate_outputs, packed_forecast, prediction_outputs
+from magnetosuture_thread.bags.reading import header_stamp
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import WAITING, PredictionResult, ThreadSession

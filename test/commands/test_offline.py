@@ -16,11 +16,10 @@ import pytest
 
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import packed_compressed_image
+from magnetosuture_thread.bags.packing import packed_compressed_image, packed_scene
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.recorded import BagInput, ObservationReader, Step, chosen_source, predictions

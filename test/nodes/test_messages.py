@@ -21,7 +21,7 @@ from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.bags import markers, packing, reading
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.scene_message import packed_scene
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
