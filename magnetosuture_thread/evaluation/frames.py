@@ -6,6 +6,7 @@ import math
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,16 +21,9 @@ from magnetosuture_thread.thread.prediction import Prediction
 
 Array = NDArray[np.float64]
 
+_no_numbers, _no_points = partial(np.empty, 0), partial(np.empty, (0, 2))
 MARGIN = "margin_"  # columns of margins, by the barrier's name
 SILENT_PERIODS = 5.0  # usual intervals; a longer one without frames is a gap
-
-
-def _nothing() -> Array:
-    return np.empty(0)
-
-
-def _no_points() -> Points:
-    return np.empty((0, 2))
 
 
 @dataclass
@@ -51,15 +45,15 @@ class Observation:
     """
 
     stamp: int
-    tail: Array = field(default_factory=_nothing)
-    heading: Array = field(default_factory=_nothing)
+    tail: Array = field(default_factory=_no_numbers)
+    heading: Array = field(default_factory=_no_numbers)
     measured: Points = field(default_factory=_no_points)
     ground_truth: Points = field(default_factory=_no_points)
     reason: str = ""
     processing: float = math.nan
     observation: ThreadObservation | None = None
     deviation: tuple[float, float] = (0.0, 0.0)
-    true_pull: Array = field(default_factory=_nothing)
+    true_pull: Array = field(default_factory=_no_numbers)
     recorded: Points = field(default_factory=_no_points)
 
     @property
@@ -82,15 +76,9 @@ class EstimatedThread:
 
     vertices: Points
     corrected: bool = False
-    squared: Array = field(default_factory=_nothing)
+    squared: Array = field(default_factory=_no_numbers)
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
-
-    @classmethod
-    def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
-        """Return what is kept of an estimate."""
-        squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
 
 
 @dataclass(kw_only=True)
@@ -115,7 +103,7 @@ class FrameResult(Observation):
     residual: float = math.nan
     step_time: float = math.nan
     tension: float = math.nan
-    pull: Array = field(default_factory=_nothing)
+    pull: Array = field(default_factory=_no_numbers)
     margins: Margins | None = None
     obstacles: tuple[Obstacle, ...] = ()
     errors: dict[str, float] = field(default_factory=dict)
@@ -144,7 +132,11 @@ class FrameResult(Observation):
             estimated: whether the thread is estimated in this run; without an estimate the prediction stands for it.
             obstacles: in force.
         """
-        instead = EstimatedThread(prediction.positions) if estimated else None
+        kept = EstimatedThread(prediction.positions) if estimated else None
+        if estimate is not None:
+            squared = _no_numbers() if estimate.innovations is None else estimate.innovations.normalised_squared
+            rest = squared, estimate.disturbances, estimate.hidden
+            kept = EstimatedThread(estimate.positions, estimate.corrected, *rest)
         forces = prediction.forces
         return cls(
             **vars(observation),
@@ -153,10 +145,10 @@ class FrameResult(Observation):
             residual=prediction.residual,
             step_time=step_time,
             tension=math.nan if forces is None else forces.peak_tension,
-            pull=np.empty(0) if forces is None else np.asarray(forces.needle_force),
+            pull=_no_numbers() if forces is None else np.asarray(forces.needle_force),
             margins=margins,
             obstacles=obstacles,
-            estimate=instead if estimate is None else EstimatedThread.of(estimate),
+            estimate=kept,
         )
 
     def target_curve(self, target: str) -> Points:
@@ -207,11 +199,6 @@ class TimeSeries:
         self._times.append(time)
         for name, column in self._columns.items():
             column.append(values.get(name, math.nan))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-        return tuple(self._columns)
 
     @property
     def times(self) -> Array:

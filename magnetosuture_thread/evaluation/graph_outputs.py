@@ -64,25 +64,20 @@ class CurrentSeries:
 
     def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
         """Compare with the currents in force when recorded; None where nothing can be."""
-        stamps, own = np.array(sorted(recorded._received), np.int64), sorted(self._received)
-        latest = np.searchsorted(stamps, own, side="right") - 1
-        pairs = [
-            (self._received[stamp], recorded._received[int(stamps[index])])
-            for stamp, index in zip(own, latest, strict=True)
-            if index >= 0 and stamp - stamps[index] <= 50_000_000  # ns, for which currents are in force
-        ]
-        pairs = [(now, then) for now, then in pairs if now[0].shape == then[0].shape]
+        stamps, replayed = np.array(sorted(recorded._received), np.int64), sorted(self._received)
+        pairs = []
+        for stamp, index in zip(replayed, np.searchsorted(stamps, replayed, side="right") - 1, strict=True):
+            if index >= 0 and stamp - stamps[index] <= 50_000_000:  # ns, for which currents are in force
+                now, then = self._received[stamp], recorded._received[int(stamps[index])]
+                if now[0].shape == then[0].shape:
+                    pairs.append((now, then))
         if not pairs:
             return None
         difference = np.abs([now[0] - then[0] for now, then in pairs])
-        return CurrentDifference(
-            compared=len(pairs),
-            difference=float(np.median(difference)),
-            p99=float(np.percentile(difference, 99)),
-            greatest=float(difference.max()),
-            recorded=_rms(np.array([then[0] for _, then in pairs])),
-            stopped_apart=float(np.mean([now[1] != then[1] for now, then in pairs])),
-        )
+        median, p99, greatest = np.percentile(difference, (50, 99, 100)).tolist()
+        level = _rms(np.array([then[0] for _, then in pairs]))
+        stopped_apart = float(np.mean([now[1] != then[1] for now, then in pairs]))
+        return CurrentDifference(len(pairs), median, p99, greatest, level, stopped_apart)
 
 
 class GraphCollector:
@@ -116,9 +111,9 @@ class GraphCollector:
             case interface.NEEDLE_POSE.recorded:
                 self.poses += 1
             case interface.MEASURED_THREAD.recorded:
-                self._of(message).measured = _points(each.pose.position for each in message.poses)
+                self._of(message).measured = _points(stamped.pose.position for stamped in message.poses)
             case interface.GROUND_TRUTH_THREAD.recorded:
-                self._of(message).ground_truth = _points(each.pose.position for each in message.poses)
+                self._of(message).ground_truth = _points(stamped.pose.position for stamped in message.poses)
             case interface.GROUND_TRUTH_PULL.recorded:
                 self._of(message).true_pull = _in_plane(message.wrench.force)
             case interface.THREAD_OBSERVATION.recorded:
@@ -163,22 +158,14 @@ class GraphCollector:
 
 
 def _estimate(message: Any) -> EstimatedThread:
-    degrees = int(message.innovation_degrees)
-    disturbances = tuple(
-        Disturbance(
-            found.arc_length,
-            found.extent,
-            _in_plane(found.position),
-            _in_plane(found.direction),
-            found.force,
-            found.significance,
-            nanoseconds(found.since) * 1e-9,
-        )
-        for found in message.disturbances
-    )
+    disturbances = []
+    for contact in message.disturbances:
+        stretch, force = (contact.arc_length, contact.extent), (contact.force, contact.significance)
+        place, since = map(_in_plane, (contact.position, contact.direction)), nanoseconds(contact.since) * 1e-9
+        disturbances.append(Disturbance(*stretch, *place, *force, since))
+    degrees, vertices = int(message.innovation_degrees), _points(message.positions)
     squared = np.full(degrees, message.innovation_squared / max(degrees, 1))
-    vertices = _points(message.positions)
-    return EstimatedThread(vertices, not message.prediction_only, squared, disturbances, message.hidden)
+    return EstimatedThread(vertices, not message.prediction_only, squared, tuple(disturbances), message.hidden)
 
 
 def _in_plane(vector: Any) -> Array:
@@ -284,10 +271,10 @@ class ReplaySummary(RunSummary):
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""
-        figures = {name: value for name, value in asdict(self).items() if name != "estimation"}
+        figures = asdict(self)
+        events = figures.pop("estimation")["disturbances"]
         figures["silence"]["at"] = finite_or_none(self.silence.at)
-        events = [asdict(event) for event in self.estimation.disturbances]
-        return figures | self.estimation.to_json() | {"disturbances": events}
+        return figures | self.estimation.to_json() | {"disturbances": list(events)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -385,13 +372,13 @@ class LoopCollector:
         frames = {stamp for stamp in self._truth if first <= stamp <= last}
         both = sorted(self._tracked.keys() & frames)
         if not both:
-            said = "; ".join(f"{name}: {text}" for name, text in sorted(self._threads.health.items()))
-            raise GraphError(f"the needle was tracked in no frame; {said}")
+            health = "; ".join(f"{name}: {text}" for name, text in sorted(self._threads.health.items()))
+            raise GraphError(f"the needle was tracked in no frame; {health}")
         self.instants = self._threads.frames(first, last)
         apart = np.array([self._tracked[stamp] - self._truth[stamp] for stamp in both])
         tail, heading = np.linalg.norm(apart[:, :2], axis=1), np.abs(np.angle(np.exp(1j * apart[:, 2])))
         off = np.array([np.linalg.norm(self._tip(s) - self._setpoints[s][:2]) for s in both if s in self._setpoints])
-        states = [found for stamp, found in self._states.items() if stamp in frames]
+        states = [state for stamp, state in self._states.items() if stamp in frames]
         return LoopSummary(
             setup=setup,
             duration=(last - first) * 1e-9,
