@@ -80,6 +80,14 @@ class EstimatedThread:
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
 
+    @classmethod
+    def of(cls, estimate: ThreadEstimate | None, prediction: Prediction) -> EstimatedThread:
+        """Return what is kept of an estimate; without one the prediction stands for it."""
+        if estimate is None:
+            return cls(prediction.positions)
+        squared = _no_numbers() if estimate.innovations is None else estimate.innovations.normalised_squared
+        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
+
 
 @dataclass(kw_only=True)
 class FrameResult(Observation):
@@ -111,15 +119,7 @@ class FrameResult(Observation):
 
     @classmethod
     def of(
-        cls,
-        observation: Observation,
-        prediction: Prediction,
-        margins: Margins | None,
-        step_time: float,
-        *,
-        estimate: ThreadEstimate | None = None,
-        estimated: bool = False,
-        obstacles: tuple[Obstacle, ...] = (),
+        cls, observation: Observation, prediction: Prediction, margins: Margins | None, step_time: float
     ) -> FrameResult:
         """Return a prediction with the observation that it is of.
 
@@ -128,15 +128,7 @@ class FrameResult(Observation):
             prediction: of it.
             margins: of the prediction, if they prove anything.
             step_time: that the prediction took [s].
-            estimate: of the same frame.
-            estimated: whether the thread is estimated in this run; without an estimate the prediction stands for it.
-            obstacles: in force.
         """
-        kept = EstimatedThread(prediction.positions) if estimated else None
-        if estimate is not None:
-            squared = _no_numbers() if estimate.innovations is None else estimate.innovations.normalised_squared
-            rest = squared, estimate.disturbances, estimate.hidden
-            kept = EstimatedThread(estimate.positions, estimate.corrected, *rest)
         forces = prediction.forces
         return cls(
             **vars(observation),
@@ -147,8 +139,6 @@ class FrameResult(Observation):
             tension=math.nan if forces is None else forces.peak_tension,
             pull=_no_numbers() if forces is None else np.asarray(forces.needle_force),
             margins=margins,
-            obstacles=obstacles,
-            estimate=kept,
         )
 
     def target_curve(self, target: str) -> Points:

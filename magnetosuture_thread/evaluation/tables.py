@@ -19,6 +19,7 @@ from magnetosuture_thread.evaluation.frames import TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary, RunSummary
 from magnetosuture_thread.evaluation.metrics import (
     KINDS,
+    STAGES,
     TARGETS,
     Percentiles,
     RunMetrics,
@@ -32,7 +33,6 @@ from magnetosuture_thread.settings.errors import ConfigurationError, printable
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 
-STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
 TEXTS = ("bag", "path", "setup", "simulated", "source", "formulation", "damage", "unverified", "problem")
 TIMES = ("step_median_s", "step_p99_s", "tracker_median_s", "tracker_p99_s")  # differ from run to run
 ENDINGS = (".json", ".csv", ".parquet")
