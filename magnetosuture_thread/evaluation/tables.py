@@ -18,7 +18,6 @@ from rich.text import Text
 from magnetosuture_thread.evaluation.frames import TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary, RunSummary
 from magnetosuture_thread.evaluation.metrics import (
-    KINDS,
     STAGES,
     TARGETS,
     Percentiles,
@@ -55,15 +54,9 @@ def row_of(
         facts: the columns of `TEXTS`, `duration_s` and `refused`.
     """
     silence = silence or SensorSilence()
-    row: Row = dict.fromkeys(TEXTS[:6], "") | {
-        "duration_s": None,
-        "frames": len(metrics.observed),
-        "tracked": metrics.tracked,
-        "predicted": len(metrics.series),
-        "silent_s": silence.total,
-        "max_silence_s": silence.max_gap,
-        "silences": silence.gaps,
-    }
+    row: Row = dict.fromkeys(TEXTS[:6], "") | {"duration_s": None}
+    row |= {"frames": len(metrics.observed), "tracked": metrics.tracked, "predicted": len(metrics.series)}
+    row |= {"silent_s": silence.total, "max_silence_s": silence.max_gap, "silences": silence.gaps}
     for prefix in ("error", "recorded_error"):
         errors = metrics.errors(prefix)
         for target in TARGETS:
@@ -93,12 +86,10 @@ def row_of(
     return {column: finite_or_none(value) for column, value in row.items()}
 
 
-_EMPTY = row_of(RunMetrics(1.0))
-
-
 def failed_row(name: str, path: str, problem: str) -> Row:
     """Return the row of a bag that could not be evaluated."""
-    row: Row = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in _EMPTY.items()}
+    empty = row_of(RunMetrics(1.0))
+    row: Row = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in empty.items()}
     return row | dict.fromkeys(TEXTS, "") | {"bag": name, "path": path, "problem": problem}
 
 
@@ -135,10 +126,10 @@ def write_table(path: Path, rows: Sequence[Row], document: Any) -> None:
         document: what JSON gets.
     """
     if path.suffix == ".parquet":
-        from pyarrow import Table as ArrowTable
+        import pyarrow
         from pyarrow import parquet
 
-        parquet.write_table(ArrowTable.from_pylist([flat(row) for row in rows]), path)
+        parquet.write_table(pyarrow.Table.from_pylist([flat(row) for row in rows]), path)
     elif path.suffix == ".csv":
         path.write_text(table_csv(rows), encoding="utf-8", newline="")
     else:
@@ -182,12 +173,12 @@ def bags_document(rows: Sequence[Row]) -> dict[str, Any]:
 
 def compare_bags(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return the errors of `prediction` and `estimate` over bags; None where no bag has any."""
-    compared: dict[str, dict[str, float | None]] = compare_errors(TimeSeries())
-    for kind in KINDS:
-        for name in compared[kind]:
+    compared = compare_errors(TimeSeries())
+    for kind, errors in compared.items():
+        for name in errors:
             values = _numbers([cast("Row", row[kind]) for row in rows], name)
             whole = np.mean if name.endswith("_mean_percent") else np.max
-            compared[kind][name] = float(whole(values)) if values else None
+            errors[name] = float(whole(values)) if values else None
     return compared
 
 
@@ -271,9 +262,9 @@ def outcome_line(outcome: Mapping[str, Any]) -> tuple[str, str, str]:
 
 def micrometres(metres: float) -> str:
     """Return a margin as text; what is 0 within the solvers' tolerance is written so."""
-    return (
-        "0 µm" if abs(metres) <= 1e-9 else f"{1e6 * metres:.3g} µm" if abs(metres) < 1e-4 else f"{1e3 * metres:.3g} mm"
-    )
+    if abs(metres) <= 1e-9:
+        return "0 µm"
+    return f"{1e6 * metres:.3g} µm" if abs(metres) < 1e-4 else f"{1e3 * metres:.3g} mm"
 
 
 def _figures_table(title: str, lines: Mapping[str, str]) -> Table:
