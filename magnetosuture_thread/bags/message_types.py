@@ -30,10 +30,10 @@ MAX_DECODED = 1_000_000  # objects that the data of one message may become
 def typestore() -> Typestore:
     """Return the types of ROS 2 Jazzy and of magnetosuture_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    own = {}
+    types = {}
     for path in sorted((share_directory("magnetosuture_msgs") / "msg").glob("*.msg")):
-        own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"magnetosuture_msgs/msg/{path.stem}"))
-    store.register(own)
+        types.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"magnetosuture_msgs/msg/{path.stem}"))
+    store.register(types)
     return store
 
 
@@ -168,13 +168,13 @@ def _parsed_types(definition: MessageDefinition, budget: Budget) -> Types:
         is_msg = definition.encoding == "ros2msg"
         parser = _BoundedMsgParser(f"MSG: {name}\n{text}") if is_msg else _BoundedIdlParser(text)
         parser.budget = budget
-        own = dict(make_typesdict(parser.specification()))
+        types = dict(make_typesdict(parser.specification()))
     except BagError:
         raise BagError(name, "a definition that takes too many steps to parse") from None
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return {}
-    used = {_type_within(kind) for _, fields in own.values() for _, kind in fields} - {""}
-    return own if used <= {*own, *ours} else {}
+    used = {_type_within(kind) for _, fields in types.values() for _, kind in fields} - {""}
+    return types if used <= {*types, *ours} else {}
 
 
 def _fields_within(name: str, types: Types) -> Types:

@@ -148,7 +148,7 @@ class Recording:
                 return ""  # used by the other camera channel
         accepted = {*CONVERTED.get(channel.type_name, ()), channel.type_name}
         if name in bag.conflicts:
-            self.unfit[name] = f"topic {name} has two types, {' and '.join(bag.conflicts[name])}; expected one"
+            self.unfit[name] = bag.conflict(name)
         elif bag.topics.get(name) in accepted:
             return name
         elif name in bag.topics:
@@ -336,8 +336,8 @@ def _marker_poses(message: Any) -> list[list[float]]:
     """Return the points of a Marker that is a line strip, as poses."""
     if message.action != 0 or message.type != MarkerType.LINE_STRIP:
         raise UnfitError("a marker that is no line strip being added")
-    own = np.array(_pose(message.pose.position, message.pose.orientation))
-    place, turn = own[:3], own[3:] if own[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation
+    pose = np.array(_pose(message.pose.position, message.pose.orientation))
+    place, turn = pose[:3], pose[3:] if pose[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation
     if not np.isfinite(place).all():
         raise UnfitError("a place that is not finite")
     points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)

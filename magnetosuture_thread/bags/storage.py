@@ -1,4 +1,4 @@
-"""What the formats of bags share: files and metadata, connections, messages by time, damage, and caps on sizes."""
+"""Common parts of the formats of bags: files and metadata, connections, messages by time, damage, caps on sizes."""
 
 from __future__ import annotations
 

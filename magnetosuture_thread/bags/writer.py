@@ -1,7 +1,7 @@
 """Writes and repairs bags: mcap in small chunks, by the package `mcap`, readable after a crash or on a full disk.
 
-Messages are taken by one thread and written by another, which no signal interrupts: the file stays whole whatever stops
-a recorder, and the callback that a message came by does not wait for the disk.
+Messages are written by a worker, which no signal interrupts: the file stays whole whatever stops a recorder, and the
+callback that a message came by does not wait for the disk.
 
 Source: the MCAP specification, https://mcap.dev/spec.
 """
@@ -84,7 +84,7 @@ class BagWriter:
         self._bytes, self._first, self._last = 0, MAX_TIME, 0  # of the pending messages
         self._defined = 0  # connections when the last chunk was begun
         self._closed = False
-        # What follows is of the thread that writes.
+        # What follows is of the worker.
         self._schemas: dict[MessageDefinition, int] = {MessageDefinition(""): 0}
         self._registered = 0  # connections that the file has
         self._counts: Counter[int] = Counter()
@@ -128,11 +128,11 @@ class BagWriter:
         Raises:
             BagError: the type is unknown, and no definition is given.
         """
-        own = own_definition(type_name)
-        definition = definition or own
+        ours = own_definition(type_name)
+        definition = definition or ours
         if not definition.text:
             raise BagError(topic, f"the type {type_name} has no definition")
-        type_hash = typestore().hash_rihs01(type_name) if definition == own else ""
+        type_hash = typestore().hash_rihs01(type_name) if definition == ours else ""
         connection = Connection(topic, definition, metadata={QOS: "", TYPE_HASH: type_hash})
         self._topics[topic] = self.add_connection(connection)
 
@@ -302,7 +302,7 @@ class BagWriter:
 
 @dataclass
 class RepairReport:
-    """What became of a bag.
+    """Counts of what a repaired bag holds, lacks, and holds otherwise.
 
     Attributes:
         messages: that the new bag holds.

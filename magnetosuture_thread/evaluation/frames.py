@@ -64,7 +64,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class EstimatedThread:
-    """What is kept of a thread's estimate.
+    """A thread's estimate, as far as it is kept.
 
     Attributes:
         vertices: shape (n + 1, 2) [m].

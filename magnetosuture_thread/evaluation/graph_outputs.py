@@ -1,4 +1,4 @@
-"""What a graph published, put side by side by stamp: the figures of a replay and of a closed loop."""
+"""Outputs of a graph side by side by stamp, and the figures of a replay and of a closed loop."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from magnetosuture_thread.settings.errors import GraphError, InvalidInputError
 
 @dataclass(frozen=True)
 class CurrentDifference:
-    """How far the currents of a replay are from the recorded ones, at the times of the replay's.
+    """Difference of the currents of a replay from the recorded ones, at the times of the replay's.
 
     In places the coils can give the same velocity in two ways, far apart, and change from one to the other
     within a hundredth of a second: the greatest differences are of such moments.

@@ -212,7 +212,7 @@ class MinimumMargin:
 
     @property
     def promised(self) -> float:
-        """What the barrier keeps at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
+        """Margin that the barrier keeps at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
         return self.value if self.kind in SOLID else self.clearance
 
     @property
@@ -247,7 +247,7 @@ def hidden_part(frame: FrameResult, length: float) -> float:
 
 @dataclass(frozen=True)
 class HiddenShares:
-    """How much of the thread was hidden, for how long. Each frame counts for the time until the next one.
+    """Hidden shares of thread and time. Each frame counts for the time until the next one.
 
     Attributes:
         time: share of the time in which a part of the thread was hidden: more than 3 % of its length.
@@ -381,7 +381,7 @@ def compare_errors(series: TimeSeries) -> dict[str, dict[str, float | None]]:
 
 @dataclass(frozen=True)
 class EstimationFigures:
-    """What a run tells of its estimate beside the errors.
+    """Figures of a run's estimate beside the errors.
 
     Attributes:
         corrected: number of frames whose estimate took a measurement; of the others it is a prediction only.
@@ -534,7 +534,7 @@ class RunMetrics:
 
     @property
     def target(self) -> str:
-        """What error map and worst frames are compared with: the truth where there is any; empty for nothing."""
+        """Target of error map and worst frames: the truth where there is any; empty for none."""
         return next((target for target in self.targets if len(self.series.known(f"error_{target}"))), "")
 
     def error_map(self, kind: str = "prediction") -> ErrorMap | None:
@@ -552,7 +552,7 @@ class RunMetrics:
 
     @property
     def estimation(self) -> EstimationFigures:
-        """What the run tells of its estimate beside the errors."""
+        """Figures of the run's estimate beside the errors."""
         corrected = int(np.nansum(self.series.column("corrected")))
         consistency, hidden = Consistency.of(self.series), HiddenShares.of(self.series)
         return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances))

@@ -293,7 +293,7 @@ def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
 
 
 def tidy(axes: Axes) -> None:
-    """Give a plot the look of all of ours."""
+    """Draw grid, ticks and frame of a plot as in all of ours."""
     axes.grid(True, color="#e4e8ec", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8.5, colors=INK, length=3)

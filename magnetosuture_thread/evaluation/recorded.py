@@ -366,7 +366,7 @@ def predictions(reader: ObservationReader, settings: ThreadModelSettings, scene:
 
 
 class BagSelection(TypedDict, total=False):
-    """What of a bag is read, and with which setup.
+    """Part of a bag that is read, and the setup.
 
     Attributes:
         setup_name: name or path of the setup; the one that the bag names if empty.

@@ -109,7 +109,7 @@ def read_reference(path: Path) -> ReferenceTrajectory:
 
 @dataclass(frozen=True)
 class CaseScore:
-    """How a formulation did on one trajectory.
+    """Scores of a formulation on one trajectory.
 
     Attributes:
         name: of the case.
@@ -267,7 +267,7 @@ def _score_each(
 
 
 class StepFigures(NamedTuple):
-    """What one step of a simulated or predicted thread gave.
+    """Figures of one step of a simulated or predicted thread.
 
     Attributes:
         vertices: of the thread, shape (n + 1, 2) [m].
