@@ -17,6 +17,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
@@ -80,20 +81,20 @@ def split_records(
     """
     while position < size:
         head = read(position, position + _RECORD.size + _MESSAGE.size)
-        opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
+        opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, size)
         end = position + _RECORD.size + length
         if end > size:
             raise CorruptError("it is truncated or corrupt")
         if opcode == Opcode.MESSAGE:
-            is_odd = not _MESSAGE.size <= length <= MAX_RECORD_BYTES
+            is_valid = _MESSAGE.size <= length <= MAX_RECORD_BYTES
         elif opcode == Opcode.MESSAGE_INDEX:
-            is_odd = int.from_bytes(head[11:15], "little") != length - 6
+            is_valid = int.from_bytes(head[11:15], "little") == length - 6
         elif opcode == Opcode.ATTACHMENT or opcode >= _MIN_PRIVATE_OPCODE:
-            is_odd = False
+            is_valid = True
         else:
             most = MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _MAX_DEFINITION_BYTES
-            is_odd = not Opcode.HEADER <= opcode <= Opcode.DATA_END or length > most
-        if is_odd:
+            is_valid = Opcode.HEADER <= opcode <= Opcode.DATA_END and length <= most
+        if not is_valid:
             raise CorruptError("no record where one is expected")
         yield opcode, position, end, head
         position = end
@@ -192,10 +193,8 @@ def connections_of(definitions: Iterable[Any]) -> dict[int, Connection]:
             table[record.id] = None
     known: dict[int, Connection] = {}
     for number, channel in channels.items():
-        schema = schemas.get(channel.schema_id) if channel is not None else None
-        if schema is not None:
-            text = schema.data.decode("utf-8", "surrogateescape")
-            definition = MessageDefinition(schema.name, schema.encoding, text)
+        if channel is not None and (schema := schemas.get(channel.schema_id)) is not None:
+            definition = MessageDefinition(schema.name, schema.encoding, schema.data.decode("utf-8", "surrogateescape"))
             known[number] = Connection(channel.topic, definition, channel.message_encoding, channel.metadata)
     return known
 
@@ -236,10 +235,8 @@ class McapFile:
         self._budget = budget
         self._blocks: list[Block] = []
         self._regions: list[CorruptRegion] = []
-        # By the bytes of their records: of chunks with a checksum, of other data, of the summary.
-        self._definitions: dict[bytes, Any] = {}
-        self._loose_definitions: dict[bytes, Any] = {}
-        self._summary_definitions: dict[bytes, Any] = {}
+        # By the bytes of their records.
+        self._definitions: dict[str, dict[bytes, Any]] = {"verified": {}, "loose": {}, "summary": {}}
         self._metadata: list[Metadata] = []
         self._statistics: Statistics | None = None
         self._data_end = self._data_crc = 0  # where the data section ends, 0 where that is not known; its checksum
@@ -302,7 +299,7 @@ class McapFile:
             data = read_range(stream, block.offset, block.offset + block.length)
             if block.is_chunk:
                 data, has_checksum = unpack_chunk(data)
-                if (block.crc is None and not has_checksum) or block.crc not in (None, zlib.crc32(data)):
+                if not has_checksum if block.crc is None else block.crc != zlib.crc32(data):
                     raise CorruptError("a chunk without a checksum, or other bytes than before")
             for opcode, first, last, head in split_records(lambda start, end: data[start:end], len(data)):
                 if opcode == Opcode.MESSAGE:
@@ -312,8 +309,7 @@ class McapFile:
         except CorruptError as error:
             problem = f"has {error} at byte {block.offset}; `bag check` of a copy tells what is intact"
             raise BagError(self.path, problem) from None
-        messages.sort()
-        for time, first, last, channel, sequence, publish_time in messages:
+        for time, first, last, channel, sequence, publish_time in sorted(messages):
             yield StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
 
     def _read_index(self, stream: BinaryIO, size: int) -> bool:
@@ -330,23 +326,25 @@ class McapFile:
             footer = parse_record(read_range(stream, size - _RECORD.size - 20 - len(MAGIC), size))
         except (McapError, CorruptError, struct.error, ValueError):
             return False
-        counts = {channel: count for channel, count in summary.statistics.channel_message_counts.items() if count}
-        connections = connections_of([*summary.schemas.values(), *summary.channels.values()])
+        statistics, chunks = summary.statistics, summary.chunk_indexes
+        self.counts = +Counter(statistics.channel_message_counts)
+        self.connections = connections_of([*summary.schemas.values(), *summary.channels.values()])
         if not (
-            footer.summary_crc != 0
-            and _crc(stream, footer.summary_start, size - len(MAGIC) - 4) == footer.summary_crc
-            and sum(counts.values()) == summary.statistics.message_count
-            and counts.keys() <= connections.keys()
-            and summary.statistics.chunk_count == len(summary.chunk_indexes) > 0
-            and all(index.message_index_offsets for index in summary.chunk_indexes)
+            _crc(stream, footer.summary_start, size - len(MAGIC) - 4) == footer.summary_crc != 0
+            and self.counts.total() == statistics.message_count
+            and self.counts.keys() <= self.connections.keys()
+            and statistics.chunk_count == len(chunks) > 0
+            and all(index.message_index_offsets for index in chunks)
         ):
             return False
-        for index in summary.chunk_indexes:
+        for index in chunks:
+            place, counts = (
+                (index.chunk_start_offset, index.chunk_length),
+                dict.fromkeys(index.message_index_offsets, 0),
+            )
             times = index.message_start_time, index.message_end_time
-            channels = dict.fromkeys(index.message_index_offsets, 0)
-            self._blocks.append(Block(index.chunk_start_offset, index.chunk_length, True, True, None, *times, channels))
-        self.counts, self.connections, self._metadata = Counter(counts), connections, metadata
-        self.others["attachment"] = summary.statistics.attachment_count
+            self._blocks.append(Block(*place, True, True, None, *times, counts))
+        self._metadata, self.others["attachment"] = metadata, statistics.attachment_count
         return True
 
     def _scan(self, stream: BinaryIO, size: int, progress: Callable[[int], None]) -> None:
@@ -406,8 +404,7 @@ class McapFile:
                 case Statistics() as statistics:
                     self._statistics = statistics
                 case Schema() | Channel() as definition:
-                    definitions = self._summary_definitions if self._data_end else self._loose_definitions
-                    definitions[record] = definition
+                    self._definitions["summary" if self._data_end else "loose"][record] = definition
 
     def _add_chunk(self, record: bytes, position: int) -> None:
         """Add a chunk and its definitions; nothing of it where a record is corrupt."""
@@ -418,9 +415,9 @@ class McapFile:
             self._budget.spend("records", 1)
             if opcode == Opcode.MESSAGE:
                 block.add(head)
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data[start:end] not in self._definitions:
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data[start:end] not in self._definitions["verified"]:
                 definitions[data[start:end]] = self._parse_and_keep(data[start:end])
-        (self._definitions if has_checksum else self._loose_definitions).update(definitions)
+        self._definitions["verified" if has_checksum else "loose"] |= definitions
         self._blocks.append(block)
 
     def _parse_and_keep(self, record: bytes) -> Any:
@@ -460,13 +457,10 @@ class McapFile:
                 opcode, length = _RECORD.unpack_from(window, match.start())
                 if at == corrupt or length > min(MAX_RECORD_BYTES, size - at):
                     continue
-                if opcode == Opcode.DATA_END:
-                    return at
-                try:
-                    if unpack_chunk(read_range(stream, at, at + _RECORD.size + length), self._budget)[1]:
+                record = read_range(stream, at, at + _RECORD.size + length)
+                with suppress(CorruptError):
+                    if opcode == Opcode.DATA_END or unpack_chunk(record, self._budget)[1]:
                         return at
-                except CorruptError:
-                    continue
             position += max(1, len(window) - 64)  # more than a match
         return size
 
@@ -475,8 +469,8 @@ class McapFile:
         statistics, regions = self._statistics, self._regions
         corrupt_bytes = sum(region.end - region.start for region in regions)
         is_private = self.others["record of a private kind"] > 0
-        is_scanned = not is_private and self._data_end > 0 and all(r.start >= self._data_end for r in regions)
-        is_scanned = is_scanned or self._is_verified
+        is_whole = not is_private and self._data_end > 0 and all(r.start >= self._data_end for r in regions)
+        is_scanned = is_whole or self._is_verified
         # A recorder does not write the same messages with the same times again, but a copy of a part of a file does.
         is_odd = regions or statistics is None or _contradiction(statistics, self._blocks)
         if is_odd and not self._is_verified:
@@ -490,9 +484,9 @@ class McapFile:
         if not regions and statistics is not None and (problem := _contradiction(statistics, self._blocks)):
             self._add_region(problem, self._data_end, size)
             is_scanned = False
-        if not regions and self._data_crc and not self._is_verified:
+        if not regions and not self._is_verified and self._data_crc:
             self._add_region("data other than messages does not match its checksum", 0, size)
-        if not regions and statistics is None and not self._is_verified and is_private:
+        if not regions and not self._is_verified and statistics is None and is_private:
             self._add_region("records of a private kind, which may be corrupt others", 0, size)
         is_sound = self._is_verified or not regions
         loose = [block for block in self._blocks if not block.has_checksum]
@@ -500,10 +494,9 @@ class McapFile:
             self._blocks = [block for block in self._blocks if block.has_checksum]
             count = pluralize(_count(loose).total(), "message")
             self._add_region(f"{count} without a checksum, which may be wrong", *_extent(loose))
-        loose_definitions = self._loose_definitions if is_sound else {}
-        summary_definitions = self._summary_definitions if self._is_trusted else {}
-        definitions = self._definitions, loose_definitions, summary_definitions
-        self.connections = connections_of(chain.from_iterable(table.values() for table in definitions))
+        usable = {"verified": True, "loose": is_sound, "summary": self._is_trusted}
+        definitions = (table.values() for kind, table in self._definitions.items() if usable[kind])
+        self.connections = connections_of(chain.from_iterable(definitions))
         self.counts = _count(self._blocks)
         for channel in sorted(self.counts.keys() - self.connections.keys()):
             block = next(block for block in self._blocks if channel in block.counts)

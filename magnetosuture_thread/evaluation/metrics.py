@@ -212,7 +212,7 @@ class MinimumMargin:
 
     @property
     def promised(self) -> float:
-        """Margin that the barrier keeps at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
+        """Margin that is kept at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
         return self.value if self.kind in SOLID else self.clearance
 
     @property
