@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.markers import MarkerType
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import pack
+from magnetosuture_thread.bags.packing import MarkerType, pack
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import is_in_dish_frame, stamp_and_frame
 from magnetosuture_thread.bags.storage import CDR, MAX_SILENCE

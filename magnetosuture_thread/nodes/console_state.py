@@ -11,7 +11,7 @@ from magnetosuture_msgs import msg
 from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
-from magnetosuture_thread.bags.markers import forecast_events
+from magnetosuture_thread.bags.packing import forecast_events
 from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose, parse_scene_message
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle

@@ -24,8 +24,13 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.markers import packed_forecast_markers, packed_thread_markers
-from magnetosuture_thread.bags.packing import estimate_outputs, packed_forecast, prediction_outputs
+from magnetosuture_thread.bags.packing import (
+    estimate_outputs,
+    packed_forecast,
+    packed_forecast_markers,
+    packed_thread_markers,
+    prediction_outputs,
+)
 from magnetosuture_thread.bags.reading import header_stamp
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings, parse_material
