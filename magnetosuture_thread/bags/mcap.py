@@ -34,20 +34,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, DataEnd, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from magnetosuture_thread.bags.storage import (
-    MAX_RECORD_BYTES,
-    NOTES,
-    Budget,
-    Connection,
-    CorruptRegion,
-    DamageReport,
-    MessageDefinition,
-    StoredMessage,
-    merge_by_time,
-    open_file,
-    pluralize,
-    verified_notes,
-)
+from magnetosuture_thread.bags import storage
+from magnetosuture_thread.bags.storage import Budget, Connection, CorruptRegion, DamageReport, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
@@ -86,13 +74,13 @@ def split_records(
         if end > size:
             raise CorruptError("it is truncated or corrupt")
         if opcode == Opcode.MESSAGE:
-            is_valid = _MESSAGE.size <= length <= MAX_RECORD_BYTES
+            is_valid = _MESSAGE.size <= length <= storage.MAX_RECORD_BYTES
         elif opcode == Opcode.MESSAGE_INDEX:
             is_valid = int.from_bytes(head[11:15], "little") == length - 6
         elif opcode == Opcode.ATTACHMENT or opcode >= _MIN_PRIVATE_OPCODE:
             is_valid = True
         else:
-            most = MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _MAX_DEFINITION_BYTES
+            most = storage.MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _MAX_DEFINITION_BYTES
             is_valid = Opcode.HEADER <= opcode <= Opcode.DATA_END and length <= most
         if not is_valid:
             raise CorruptError("no record where one is expected")
@@ -134,13 +122,13 @@ def unpack_chunk(record: bytes, budget: Budget | None = None) -> tuple[bytes, bo
     size, data = chunk.uncompressed_size, chunk.data
     # Behind times, size, checksum, compression and length of the records; the package reads what there is.
     begin = _RECORD.size + 40 + len(chunk.compression)
-    if size > MAX_RECORD_BYTES or record[begin - 8 : begin] != (len(record) - begin).to_bytes(8, "little"):
+    if size > storage.MAX_RECORD_BYTES or record[begin - 8 : begin] != (len(record) - begin).to_bytes(8, "little"):
         raise CorruptError(f"a chunk of {size} bytes, or of a wrong length")
     if budget is not None:
         budget.spend("unpacked bytes", len(record) + size)
     try:
         if chunk.compression == "zstd" and zstandard.frame_content_size(data) in (-1, size):  # -1: not known
-            data = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).decompress(data, max_output_size=size)
+            data = storage.unpack_zstd(data, size)
         elif chunk.compression == "lz4":
             data = _lz4.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif chunk.compression:
@@ -242,7 +230,7 @@ class McapFile:
         self._data_end = self._data_crc = 0  # where the data section ends, 0 where that is not known; its checksum
         self._is_verified = self._is_trusted = False  # the data by its checksum; the summary by its own
         try:
-            with open_file(path) as stream:
+            with storage.open_file(path) as stream:
                 size = stream.seek(0, 2)
                 head = read_range(stream, 0, HEAD_BYTES)
                 if not size:
@@ -265,16 +253,17 @@ class McapFile:
         if not self._is_verified and verified < len(self._blocks):
             what = "has messages without a checksum: damage to them" if verified else "has no checksums: damage to it"
             self.has_no_checksum = f"{what} cannot be noticed"
-        notes = (verified_notes(r.metadata, data_verified=self._is_verified) for r in self._metadata if r.name == NOTES)
+        records = [record.metadata for record in self._metadata if record.name == storage.NOTES]
+        notes = (storage.verified_notes(entries, data_verified=self._is_verified) for entries in records)
         self.notes = next((entries for entries in notes if entries is not None), {})
-        self.others["metadata record"] = sum(record.name not in (NOTES, "rosbag2") for record in self._metadata)
+        self.others["metadata record"] = sum(record.name not in (storage.NOTES, "rosbag2") for record in self._metadata)
         self.others = +self.others  # without those that there are none of
         chunks = sum(block.is_chunk for block in self._blocks)
         data = "; of all data too" if self._is_verified else ", verified as they are read" if is_indexed else ""
-        checksums = f"of {verified} of {pluralize(chunks, 'chunk')}{data}"
+        checksums = f"of {verified} of {storage.pluralize(chunks, 'chunk')}{data}"
         self.facts = {"format": "mcap", "bytes": str(size), "chunks": str(chunks), "checksums": checksums}
 
-    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[storage.StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
@@ -282,8 +271,8 @@ class McapFile:
         """
         wanted = frozenset(connections) & set(self.counts)
         try:
-            with open_file(self.path) as stream:
-                yield from merge_by_time(
+            with storage.open_file(self.path) as stream:
+                yield from storage.merge_by_time(
                     (block.start, self._read_block(stream, block, wanted, start, end))
                     for block in self._blocks
                     if block.start <= end and block.end >= start and not wanted.isdisjoint(block.counts)
@@ -293,7 +282,7 @@ class McapFile:
 
     def _read_block(
         self, stream: BinaryIO, block: Block, wanted: frozenset[int], start: int, end: int
-    ) -> Iterator[StoredMessage]:
+    ) -> Iterator[storage.StoredMessage]:
         messages = []
         try:
             data = read_range(stream, block.offset, block.offset + block.length)
@@ -310,7 +299,7 @@ class McapFile:
             problem = f"has {error} at byte {block.offset}; `bag check` of a copy tells what is intact"
             raise BagError(self.path, problem) from None
         for time, first, last, channel, sequence, publish_time in sorted(messages):
-            yield StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
+            yield storage.StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
 
     def _read_index(self, stream: BinaryIO, size: int) -> bool:
         """Take what the file holds from its summary; return whether that tells it, so that it need not be scanned."""
@@ -455,7 +444,7 @@ class McapFile:
             for match in _CHUNK_OR_END.finditer(window):
                 at = position + match.start()
                 opcode, length = _RECORD.unpack_from(window, match.start())
-                if at == corrupt or length > min(MAX_RECORD_BYTES, size - at):
+                if at == corrupt or length > min(storage.MAX_RECORD_BYTES, size - at):
                     continue
                 record = read_range(stream, at, at + _RECORD.size + length)
                 with suppress(CorruptError):
@@ -492,7 +481,7 @@ class McapFile:
         loose = [block for block in self._blocks if not block.has_checksum]
         if loose and not is_sound:
             self._blocks = [block for block in self._blocks if block.has_checksum]
-            count = pluralize(_count(loose).total(), "message")
+            count = storage.pluralize(_count(loose).total(), "message")
             self._add_region(f"{count} without a checksum, which may be wrong", *_extent(loose))
         usable = {"verified": True, "loose": is_sound, "summary": self._is_trusted}
         definitions = (table.values() for kind, table in self._definitions.items() if usable[kind])
@@ -500,7 +489,7 @@ class McapFile:
         self.counts = _count(self._blocks)
         for channel in sorted(self.counts.keys() - self.connections.keys()):
             block = next(block for block in self._blocks if channel in block.counts)
-            count = pluralize(self.counts.pop(channel), "message")
+            count = storage.pluralize(self.counts.pop(channel), "message")
             self._add_region(f"{count} of a channel without a definition, or with two", *_extent([block]))
         if regions:
             self._report_damage(corrupt_bytes, scanned if is_scanned else None)
@@ -553,5 +542,5 @@ def _contradiction(statistics: Statistics, blocks: list[Block]) -> str:
     # Some writers take a start of 0 ns for none, and the next time for it.
     if is_same and end == statistics.message_end_time and start in (0, statistics.message_start_time):
         return ""
-    number = pluralize(statistics.message_count, "message")
+    number = storage.pluralize(statistics.message_count, "message")
     return f"its summary claims {number}, and other counts or times than the {counts.total()} that it holds"

@@ -14,26 +14,10 @@ from urllib.parse import quote
 
 import zstandard
 
-from magnetosuture_thread.bags import absolute_topic
+from magnetosuture_thread.bags import absolute_topic, storage
 from magnetosuture_thread.bags.mcap import McapFile
 from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
-from magnetosuture_thread.bags.storage import (
-    CDR,
-    MAX_RECORD_BYTES,
-    NO_CHECKSUM_NOTE,
-    QOS,
-    SALVAGED_NOTE,
-    TYPE_HASH,
-    Budget,
-    Connection,
-    CorruptRegion,
-    DamageReport,
-    MessageDefinition,
-    StoredMessage,
-    find_bag_files,
-    merge_by_time,
-    merge_reports,
-)
+from magnetosuture_thread.bags.storage import CDR, Budget, Connection, CorruptRegion, DamageReport, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
@@ -126,13 +110,14 @@ class SqliteFile:
         for topic, count, first, last, longest, valid in database.execute(query):
             if topic not in self.connections or valid < count:
                 raise sqlite3.DatabaseError(f"{count} rows of which some have no valid time, topic or data")
-            if longest > MAX_RECORD_BYTES:
-                raise BagError(self.path, f"has a message of {longest} bytes; at most {MAX_RECORD_BYTES} are read")
+            if longest > storage.MAX_RECORD_BYTES:
+                problem = f"has a message of {longest} bytes; at most {storage.MAX_RECORD_BYTES} are read"
+                raise BagError(self.path, problem)
             self.counts[topic] = count
             times += first, last
         self.start, self.end = min(times, default=0), max(times, default=0)
 
-    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[storage.StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
@@ -144,7 +129,7 @@ class SqliteFile:
         try:
             with closing(self._connect()) as database:
                 for time, topic, data in database.execute(query, (*wanted, max(start, self.start), min(end, self.end))):
-                    yield StoredMessage(time, self.connections[topic], data)
+                    yield storage.StoredMessage(time, self.connections[topic], data)
         except (sqlite3.Error, OverflowError) as error:
             raise BagError(self.path, f"cannot be read any more: {_one_line(error)}") from None
 
@@ -163,7 +148,7 @@ def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
     connections = {}
     for row in map(dict[str, Any], database.execute("SELECT * FROM topics")):
         definition = definitions.get(row["type"]) or MessageDefinition(row["type"])
-        metadata = {QOS: row.get("offered_qos_profiles"), TYPE_HASH: row.get("type_description_hash")}
+        metadata = {storage.QOS: row.get("offered_qos_profiles"), storage.TYPE_HASH: row.get("type_description_hash")}
         texts = {key: text for key, text in metadata.items() if isinstance(text, str)}
         connection = Connection(row["name"], definition, row["serialization_format"], texts)
         named = (connection.topic, connection.serialization, *astuple(definition))
@@ -251,19 +236,19 @@ class Bag:
         self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda fraction: None
     ) -> None:
         self.path = path
-        files = find_bag_files(path)
+        files = storage.find_bag_files(path)
         budget = Budget(path, sum(_file_size(file) for file in files.files))
         self.decoders = DecoderCache(budget)
         self._files, problems = _open(files.files, budget, progress)
         lost = [DamageReport((region,), 0, region.end, None) for region in (*files.lost, *problems)]
-        self.damage = merge_reports([*(file.damage for file in self._files), *lost])
+        self.damage = storage.merge_reports([*(file.damage for file in self._files), *lost])
         self.remarks, self.custom_data = files.remarks, files.custom_data
         self.facts = [{"file": file.path.name, **file.facts} for file in self._files]
         self.others = sum((file.others for file in self._files), Counter[str]())
         self.notes = next((file.notes for file in self._files if file.notes), files.notes)
-        self.salvaged_without_checksum = self.notes.get(SALVAGED_NOTE, "")
+        self.salvaged_without_checksum = self.notes.get(storage.SALVAGED_NOTE, "")
         doubt = next((file.has_no_checksum for file in self._files if file.has_no_checksum), "")
-        self.has_no_checksum = doubt or self.notes.get(NO_CHECKSUM_NOTE, "")
+        self.has_no_checksum = doubt or self.notes.get(storage.NO_CHECKSUM_NOTE, "")
         filled = [file for file in self._files if file.counts]
         if not filled:
             raise BagError(files.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
@@ -304,18 +289,18 @@ class Bag:
             if topic in self.conflicts:
                 raise BagError(self.path, self.conflict(topic))
         wanted = set(self.topics if topics is None else topics)
-        loaded = (self._load(item, refused, only=CDR) for item in self._stored(wanted, start, duration))
+        loaded = (self._load(item, refused, cdr_only=True) for item in self._stored(wanted, start, duration))
         return (record for record in loaded if record is not None)
 
     def conflict(self, topic: str) -> str:
         """Return in words that a topic has two types."""
         return f"topic {topic} has two types, {' and '.join(self.conflicts[topic])}; expected one"
 
-    def stored(self) -> Iterator[StoredMessage]:
+    def stored(self) -> Iterator[storage.StoredMessage]:
         """Yield all messages by time as they are stored, whatever their type or serialization."""
         return self._stored(set(self.counts), 0.0, None)
 
-    def load(self, item: StoredMessage) -> bytes:
+    def load(self, item: storage.StoredMessage) -> bytes:
         """Return a stored message as it was before the recorder packed it, if it did.
 
         Raises:
@@ -324,14 +309,10 @@ class Bag:
         # No CDR message begins as one of zstd does: its first byte is 0.
         if item.connection.serialization != CDR or not item.data.startswith(b"\x28\xb5\x2f\xfd"):
             return item.data
-        topic = self._names[item.connection.topic]
         try:
-            if zstandard.frame_content_size(item.data) > MAX_RECORD_BYTES:
-                raise BagError(topic, f"a packed message is larger than {MAX_RECORD_BYTES} bytes")
-            # Without a size in it, a frame is unpacked to this many bytes at most.
-            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES)
-            return unpacker.decompress(item.data, max_output_size=MAX_RECORD_BYTES)
+            return storage.unpack_zstd(item.data)
         except (zstandard.ZstdError, MemoryError) as error:
+            topic = self._names[item.connection.topic]
             raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None
 
     def every_record(self, refused: Counter[str]) -> Iterator[tuple[Connection, RecordedMessage]]:
@@ -356,22 +337,23 @@ class Bag:
         """Return the name that a topic was recorded under."""
         return next(recorded for recorded, name in self._names.items() if name == topic)
 
-    def _load(self, item: StoredMessage, refused: Counter[str] | None, only: str = "") -> RecordedMessage | None:
+    def _load(
+        self, item: storage.StoredMessage, refused: Counter[str] | None, cdr_only: bool = False
+    ) -> RecordedMessage | None:
         """Return a message; None, and count it, if it cannot be decompressed or has another serialization."""
-        connection = item.connection
-        topic = self._names[connection.topic]
+        kind, topic = item.connection, self._names[item.connection.topic]
         try:
-            if only and connection.serialization != only:
-                raise BagError(topic, f"its messages are written as {connection.serialization!r}, expected {only!r}")
+            if cdr_only and kind.serialization != CDR:
+                raise BagError(topic, f"its messages are written as {kind.serialization!r}, expected {CDR!r}")
             data = self.load(item)
         except BagError as error:
             if refused is None:
                 raise
             refused[str(error)] += 1
             return None
-        return RecordedMessage(topic, connection.type_name, item.time, data, connection.definition, self.decoders)
+        return RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self.decoders)
 
-    def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[StoredMessage]:
+    def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[storage.StoredMessage]:
         first = self.start + round(start * 1e9)
         last = self.end if duration is None else first + round(duration * 1e9)
         parts = []
@@ -379,7 +361,7 @@ class Bag:
             numbers = [number for number, c in file.connections.items() if self._names[c.topic] in topics]
             if numbers:
                 parts.append((file.start, file.messages(numbers, first, last)))
-        return merge_by_time(parts)
+        return storage.merge_by_time(parts)
 
 
 def _open(files: list[Path], budget: Budget, progress: Progress) -> tuple[list[BagFile], list[CorruptRegion]]:

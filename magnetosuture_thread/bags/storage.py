@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
 import yaml
+import zstandard
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from magnetosuture_thread.settings.errors import BagError
@@ -230,6 +231,13 @@ def merge_by_time(parts: Iterable[tuple[int, Iterator[StoredMessage]]]) -> Itera
             heappop(heap)
         else:
             heapreplace(heap, (following.time, number, following, messages))
+
+
+def unpack_zstd(data: bytes, size: int = MAX_RECORD_BYTES) -> bytes:
+    """Return data unpacked, to a size at most where the frame does not say its own; any other size is a `ZstdError`."""
+    if zstandard.frame_content_size(data) > size:
+        raise zstandard.ZstdError(f"it is larger than {size} bytes")
+    return zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).decompress(data, max_output_size=size)
 
 
 def open_file(path: Path) -> BinaryIO:

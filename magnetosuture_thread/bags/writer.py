@@ -22,21 +22,9 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from mcap.writer import Writer
 
+from magnetosuture_thread.bags import storage
 from magnetosuture_thread.bags.message_types import own_definition, typestore
-from magnetosuture_thread.bags.storage import (
-    CDR,
-    METADATA_FILE,
-    NO_CHECKSUM_NOTE,
-    NOTES,
-    QOS,
-    TYPE_HASH,
-    Connection,
-    MessageDefinition,
-    add_checksum,
-    jazzy_qos_profiles,
-    parse_qos_profiles,
-    pluralize,
-)
+from magnetosuture_thread.bags.storage import CDR, QOS, TYPE_HASH, Connection, MessageDefinition, pluralize
 from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
 
 if TYPE_CHECKING:
@@ -76,7 +64,7 @@ class BagWriter:
     ) -> None:
         self.folder = folder
         self._file = folder / f"{name or folder.name}_0.mcap"
-        self._notes, self._custom_data = add_checksum(notes) if notes else {}, dict(custom_data or {})
+        self._notes, self._custom_data = storage.add_checksum(notes) if notes else {}, dict(custom_data or {})
         self._topics: dict[str, int] = {}
         self._connections: list[Connection] = []
         self._sequences: Counter[int] = Counter()
@@ -98,9 +86,9 @@ class BagWriter:
             # Chunks end by `flush` alone.
             self._mcap: Any = Writer(self._stream, chunk_size=MAX_TIME, enable_data_crcs=True)
             self._mcap.start("ros2", "magnetosuture_thread")
-            if self._notes:
-                self._mcap.add_metadata(NOTES, self._notes)  # at the head of the file, where truncation leaves them
-            self._mcap.flush()
+            if self._notes:  # at the head of the file, where truncation leaves them
+                self._mcap.add_metadata(storage.NOTES, self._notes)
+            self._mcap.flush()  # type: ignore[no-untyped-call]
         except OSError as error:
             with suppress(OSError):
                 self._file.unlink()  # of no use, but in the way of the next attempt
@@ -140,7 +128,7 @@ class BagWriter:
         """Add a connection, and return its number for `write_to`."""
         metadata = dict(connection.metadata)
         if QOS in metadata:
-            metadata[QOS] = jazzy_qos_profiles(metadata[QOS])
+            metadata[QOS] = storage.jazzy_qos_profiles(metadata[QOS])
         self._connections.append(replace(connection, metadata=metadata))
         return len(self._connections)
 
@@ -253,7 +241,7 @@ class BagWriter:
         except OSError as error:
             self._fail(error)
             return
-        metadata = self.folder / METADATA_FILE
+        metadata = self.folder / storage.METADATA_FILE
         try:
             with metadata.open("w", encoding="utf-8") as stream:
                 yaml.safe_dump({"rosbag2_bagfile_information": information}, stream, sort_keys=False)
@@ -273,6 +261,7 @@ class BagWriter:
     def _information(self) -> dict[str, Any]:
         """Return the content of metadata.yaml."""
         start = self._start if self._counts else 0
+        notes = {f"{storage.NOTES}.{key}": text for key, text in self._notes.items()}
         times = {"starting_time": {"nanoseconds_since_epoch": start}, "duration": {"nanoseconds": self._end - start}}
         count = self._counts.total()
         topics = []
@@ -281,7 +270,7 @@ class BagWriter:
                 "name": connection.topic,
                 "type": connection.type_name,
                 "serialization_format": connection.serialization,
-                "offered_qos_profiles": parse_qos_profiles(connection.metadata.get(QOS, "")),
+                "offered_qos_profiles": storage.parse_qos_profiles(connection.metadata.get(QOS, "")),
                 "type_description_hash": connection.metadata.get(TYPE_HASH, ""),
             }
             topics.append({"topic_metadata": topic, "message_count": self._counts[number]})
@@ -295,7 +284,7 @@ class BagWriter:
             "compression_mode": "",
             "relative_file_paths": [self._file.name],
             "files": [{"path": self._file.name, **deepcopy(times), "message_count": count}],  # YAML would write aliases
-            "custom_data": {**self._custom_data, **{f"{NOTES}.{key}": text for key, text in self._notes.items()}},
+            "custom_data": {**self._custom_data, **notes},
             "ros_distro": "jazzy",
         }
 
@@ -347,7 +336,7 @@ def write_repaired_bag(
     """
     notes = dict(bag.notes)
     if bag.has_no_checksum and not bag.salvaged_without_checksum:
-        notes.setdefault(NO_CHECKSUM_NOTE, f"made by `bag repair` from a bag that {bag.has_no_checksum}")
+        notes.setdefault(storage.NO_CHECKSUM_NOTE, f"made by `bag repair` from a bag that {bag.has_no_checksum}")
     report = RepairReport(dropped=bag.others)
     with BagWriter(folder, notes, name=name, custom_data=bag.custom_data) as writer:
         connections = dict.fromkeys(bag.connections())
@@ -377,6 +366,6 @@ def _repaired_connection(bag: Bag, connection: Connection, report: RepairReport)
             definition = ours
             report.defined.append(ours.type_name)
     profiles = connection.metadata.get(QOS, "")
-    if jazzy_qos_profiles(profiles) != profiles:
+    if storage.jazzy_qos_profiles(profiles) != profiles:
         report.rewritten.append(bag.name_of(connection))
     return replace(connection, topic=bag.name_of(connection), definition=definition)

@@ -21,7 +21,6 @@ from magnetosuture_thread.settings.interface import CAMERA, CURRENTS, NEEDLE_COM
 from magnetosuture_thread.thread.margins import SOLID, BarrierMargins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
-STAGES = ("frame to needle pose", "frame to prediction", "command to currents")  # of a recorded graph
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
 

@@ -18,28 +18,12 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import WAITING
+from magnetosuture_thread.evaluation import recorded
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary, figures_of
-from magnetosuture_thread.evaluation.metrics import (
-    STAGES,
-    TARGETS,
-    Percentiles,
-    RunMetrics,
-    SensorSilence,
-    finite_or_none,
-)
-from magnetosuture_thread.evaluation.recorded import (
-    NOT_FOUND,
-    NOT_NEWER,
-    BagInput,
-    BagSelection,
-    Event,
-    Step,
-    TrackedFrame,
-    open_bag,
-    predictions,
-    read_image,
-)
+from magnetosuture_thread.evaluation.metrics import TARGETS, Percentiles, RunMetrics, SensorSilence, finite_or_none
+from magnetosuture_thread.evaluation.recorded import BagInput, Event, Step, TrackedFrame
+from magnetosuture_thread.evaluation.tables import STAGES
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError, InvalidInputError
@@ -94,7 +78,7 @@ def measure_run(
     reader = bag.observations(progress)
     metrics, refused = RunMetrics(model.thread_length, bag.recording.start, targets), Counter[str]()
     began = time.perf_counter()  # kernels are loaded
-    for event in predictions(reader, model, bag.setup.scene):
+    for event in recorded.predictions(reader, model, bag.setup.scene):
         write(event)
         if isinstance(event, Observation):
             metrics.observe(event)
@@ -104,7 +88,8 @@ def measure_run(
     speed = (bag.duration - silence.total) / (time.perf_counter() - began)
     refused += reader.refused + bag.recording.refused
     if not len(metrics.series):
-        reasons = Counter(metrics.reasons) + Counter({why: n for why, n in refused.items() if why != NOT_FOUND})
+        others = Counter({why: count for why, count in refused.items() if why != recorded.NOT_FOUND})
+        reasons = Counter(metrics.reasons) + others
         words = "; ".join(f"{count} times {why}" for why, count in reasons.most_common(3)) or WAITING
         things = "frames" if reader.source == "camera" else "poses"
         counts = f"{reader.found} of {reader.count} {things} had a needle"
@@ -124,7 +109,7 @@ def _measure_step(step: Step, metrics: RunMetrics, refused: Counter[str]) -> Non
     problem = result.problem or result.estimate_problem
     if isinstance(problem, InvalidInputError):
         is_late = problem.field == "needle pose stamp"
-        refused[NOT_NEWER if is_late else f"a {problem.field} that cannot be used"] += 1
+        refused[recorded.NOT_NEWER if is_late else f"a {problem.field} that cannot be used"] += 1
     elif problem is not None:
         refused["a program that was not solved"] += 1
 
@@ -135,7 +120,7 @@ def replay_offline(
     *,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[recorded.BagSelection],
 ) -> ReplaySummary:
     """Put a bag through tracker and model without a graph, and evaluate the predictions.
 
@@ -155,7 +140,7 @@ def replay_offline(
         BagError: the bag cannot be used, nothing in it was predicted, or the output exists or cannot be written.
         ConfigurationError: the setup cannot be used.
     """
-    with open_bag(bag_path, log, **selection) as bag, whole_folder(output) as folder:
+    with recorded.open_bag(bag_path, log, **selection) as bag, whole_folder(output) as folder:
         source = "camera frames" if bag.source == "camera" else "recorded poses"
         log(f"predicting by the {source} of {bag.duration:.1f} s")
         with BagWriter(folder / "bag", bag.notes) as writer:
@@ -311,7 +296,7 @@ def find_photo(bag: BagInput, stamp: int) -> Photo | None:
         if view is not None and not is_wanted:
             continue
         try:
-            image = read_image(record)
+            image = recorded.read_image(record)
         except (BagError, InvalidInputError):
             continue
         view = VisionTracker(bag.setup.vision, bag.setup.scene).look(image).view or view

@@ -18,7 +18,6 @@ from rich.text import Text
 from magnetosuture_thread.evaluation.frames import TimeSeries
 from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary, RunSummary
 from magnetosuture_thread.evaluation.metrics import (
-    STAGES,
     TARGETS,
     Percentiles,
     RunMetrics,
@@ -32,6 +31,7 @@ from magnetosuture_thread.settings.errors import ConfigurationError, printable
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 
+STAGES = ("frame to needle pose", "frame to prediction", "command to currents")  # of a recorded graph
 TEXTS = ("bag", "path", "setup", "simulated", "source", "formulation", "damage", "unverified", "problem")
 TIMES = ("step_median_s", "step_p99_s", "tracker_median_s", "tracker_p99_s")  # differ from run to run
 ENDINGS = (".json", ".csv", ".parquet")
