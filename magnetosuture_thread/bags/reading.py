@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -69,6 +70,14 @@ def require_dish_frame(frame: str, field: str) -> None:
     """Refuse a message in another frame than the dish's."""
     if frame != interface.DISH_FRAME:
         raise InvalidInputError(f"{field}.header.frame_id", repr(frame), repr(interface.DISH_FRAME))
+
+
+def _finite(values: Any, field: str, expected: str) -> Vector:
+    """Return numbers as an array, or refuse those that are not finite."""
+    numbers = np.asarray(values, np.float64)
+    if not np.isfinite(numbers).all():
+        raise InvalidInputError(field, numbers.tolist(), expected)
+    return numbers
 
 
 def needle_pose(message: Any, directed: bool = True) -> NeedlePose:
@@ -154,10 +163,9 @@ def pose_covariance(message: Any) -> Vector | None:
     if not whole.any():
         return None
     covariance = whole[np.ix_(packing.IN_PLANE, packing.IN_PLANE)]
-    variances = np.diag(covariance)
-    if not np.isfinite(covariance).all() or (variances < 0.0).any():
-        field = f"{interface.NEEDLE_POSE.name}.pose.covariance"
-        raise InvalidInputError(field, variances.tolist(), "finite variances of at least 0")
+    if not np.isfinite(covariance).all() or (np.diag(covariance) < 0.0).any():
+        field, variances = f"{interface.NEEDLE_POSE.name}.pose.covariance", np.diag(covariance).tolist()
+        raise InvalidInputError(field, variances, "finite variances of at least 0")
     return np.asarray(covariance)
 
 
@@ -167,10 +175,10 @@ def filtered_command(message: Any) -> tuple[int, Vector, Vector, str]:
     Raises:
         InvalidInputError: a velocity is not finite, or the stamp no time.
     """
-    stamp = checked_nanoseconds(message.header.stamp, f"{interface.FILTER_STATE.name}.header.stamp")
-    commanded, filtered = np.array([[v.x, v.y] for v in (message.commanded, message.filtered)])
-    if not (np.isfinite(commanded).all() and np.isfinite(filtered).all()):
-        raise InvalidInputError(interface.FILTER_STATE.name, [*commanded, *filtered], "finite velocities [m/s]")
+    name = interface.FILTER_STATE.name
+    stamp = checked_nanoseconds(message.header.stamp, f"{name}.header.stamp")
+    velocities = [(vector.x, vector.y) for vector in (message.commanded, message.filtered)]
+    commanded, filtered = _finite(velocities, name, "finite velocities [m/s]")
     return stamp, commanded, filtered, message.source
 
 
@@ -191,9 +199,9 @@ def margins_of(message: Any) -> Margins:
     if message.friction_state not in set(FrictionState):
         raise InvalidInputError(f"{field}.friction_state", message.friction_state, "a state of SafetyMargins")
     margins = [BarrierMargins(name, *(column[row == k] for column in columns)) for k, name in enumerate(names)]
-    squeezed = tuple(int(node) for node in message.friction_nodes)
+    squeezed, touching = (tuple(map(int, nodes)) for nodes in (message.friction_nodes, message.contact_nodes))
     friction = Friction(FrictionState(message.friction_state), squeezed, message.slowdown)
-    return Margins(tuple(margins), tuple(int(node) for node in message.contact_nodes), friction, message.scene_version)
+    return Margins(tuple(margins), touching, friction, message.scene_version)
 
 
 def planar_pose(pose: Any) -> tuple[float, float, float]:
@@ -273,10 +281,7 @@ def _finite_points(corners: Any, field: str, minimum: int) -> Points:
     """Return points in the plane, shape (m, 2) [m]."""
     if not minimum <= len(corners) <= 4096:
         raise InvalidInputError(field, f"{len(corners)} points", f"{minimum} to 4096")
-    points = np.array([[point.x, point.y] for point in corners])
-    if not np.isfinite(points).all():
-        raise InvalidInputError(field, "a number that is not finite", "finite numbers")
-    return points
+    return _finite([(point.x, point.y) for point in corners], field, "finite numbers")
 
 
 def plane_velocity(message: Any, field: str) -> Vector:
@@ -301,10 +306,7 @@ def plane_point(message: Any, field: str) -> Vector:
         InvalidInputError: wrong frame, or not finite.
     """
     require_dish_frame(message.header.frame_id, field)
-    place = np.array([message.point.x, message.point.y])
-    if not np.isfinite(place).all():
-        raise InvalidInputError(f"{field}.point", place.tolist(), "finite numbers [m]")
-    return place
+    return _finite((message.point.x, message.point.y), f"{field}.point", "finite numbers [m]")
 
 
 def header_stamp(data: bytes) -> int | None:
@@ -329,11 +331,9 @@ def stamp_and_frame(topic: str, data: bytes) -> tuple[int, str]:
     if stamp is not None and data[:2] in orders and len(data) >= 16:
         (length,) = struct.unpack_from(orders[data[:2]], data, 12)
         frame = data[16 : 16 + length]
-        if 0 < length == len(frame) and frame.endswith(b"\0"):
-            try:
+        with suppress(UnicodeDecodeError):
+            if 0 < length == len(frame) and frame.endswith(b"\0"):
                 return stamp, frame[:-1].decode()
-            except UnicodeDecodeError:
-                pass
     raise BagError(topic, "a message has no header that can be read")
 
 
@@ -378,10 +378,7 @@ def read_force(record: RecordedMessage) -> Vector:
     """
     message = record.decode()
     require_dish_frame(message.header.frame_id, record.topic)
-    force = np.array([message.wrench.force.x, message.wrench.force.y])
-    if not np.isfinite(force).all():
-        raise InvalidInputError(record.topic, force.tolist(), "a finite force")
-    return force
+    return _finite((message.wrench.force.x, message.wrench.force.y), record.topic, "a finite force")
 
 
 def read_observation(record: RecordedMessage) -> ThreadObservation:

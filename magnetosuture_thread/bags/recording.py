@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import MarkerType, pack
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.reading import is_in_dish_frame, stamp_and_frame
+from magnetosuture_thread.bags.reading import is_in_dish_frame, nanoseconds, stamp_and_frame
 from magnetosuture_thread.bags.storage import CDR, MAX_SILENCE
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
@@ -28,12 +28,9 @@ from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, DISH_FR
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-TRANSFORMS = ("/tf", "/tf_static")
-POSE = "geometry_msgs/msg/PoseStamped"
-POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+TWIST, UNSTAMPED_TWIST = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 PATH = "nav_msgs/msg/Path"
-TWIST = "geometry_msgs/msg/TwistStamped"
-UNSTAMPED_TWIST = "geometry_msgs/msg/Twist"
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion without rotation
 
 Matrix = NDArray[np.float64]  # homogeneous, shape (4, 4): p' = R p + t
@@ -89,10 +86,15 @@ class Recording:
             del self.counts[CAMERA_INFO.recorded]
             self.remarks.append(f"{topic} is rectified: the lens of {CAMERA_INFO.recorded} is not undone again")
 
+    def refuse_unfit(self, *channels: Channel) -> None:
+        """Raise `BagError` if a topic with the name of one of some channels cannot be used."""
+        for channel in channels:
+            if channel.recorded in self.unfit:
+                raise BagError(self.path, self.unfit[channel.recorded])
+
     def require(self, channel: Channel) -> None:
         """Raise `BagError` unless the bag has messages for a channel."""
-        if channel.recorded in self.unfit:
-            raise BagError(self.path, self.unfit[channel.recorded])
+        self.refuse_unfit(channel)
         if not self.counts.get(channel.recorded):
             topics = ", ".join(sorted(self._bag.counts)) or "none"
             remap = f"its topics: {topics}; remap one by TOPIC:={channel.recorded}"
@@ -112,9 +114,7 @@ class Recording:
             BagError: a topic has a type that cannot be converted, or a frame without a transform to the dish frame; or
                 the bag has changed since it was opened.
         """
-        for channel in channels:
-            if channel.recorded in self.unfit:
-                raise BagError(self.path, self.unfit[channel.recorded])
+        self.refuse_unfit(*channels)
         wanted = {self._topics[channel]: channel for channel in channels if channel in self._topics}
         # The first message of each, so that an unknown frame is reported before any message is used.
         for topic, channel in wanted.items():
@@ -208,11 +208,8 @@ class Recording:
         if not frame or self._transforms.lookup(frame, self._dish_frame, None) is None:
             known = ", ".join(self._transforms.frames) or "none"
             which = f"the frame {frame}, which is not connected to {self._dish_frame}" if frame else "an empty frame"
-            raise BagError(
-                self.path,
-                f"topic {topic} has {which}; frames on {' and '.join(TRANSFORMS)}: {known}. "
-                f"If it is the dish frame, give it: --frame {frame or repr(frame)}",
-            )
+            advice = f"If it is the dish frame, give it: --frame {frame or repr(frame)}"
+            raise BagError(self.path, f"topic {topic} has {which}; frames on /tf and /tf_static: {known}. {advice}")
         matrix = self._transforms.lookup(frame, self._dish_frame, stamp)
         if matrix is None:
             raise UnfitError(f"no transform from its frame {frame} at its time")
@@ -220,7 +217,7 @@ class Recording:
 
     def _transform_messages(self) -> Iterator[tuple[str, Any]]:
         """Yield topic and message of all transforms; invalid ones are counted in `refused`."""
-        topics = [topic for topic in TRANSFORMS if self._bag.topics.get(topic) == "tf2_msgs/msg/TFMessage"]
+        topics = [topic for topic in ("/tf", "/tf_static") if self._bag.topics.get(topic) == "tf2_msgs/msg/TFMessage"]
         for record in self._bag.records(topics, refused=self.refused):
             try:
                 if not record.decoder.is_ours:
@@ -255,8 +252,7 @@ class TransformTree:
                 if topic == "/tf_static":
                     static[child] = [(-math.inf, parent, matrix)]
                 else:
-                    stamp = transform.header.stamp.sec * 10**9 + transform.header.stamp.nanosec
-                    self._edges.setdefault(child, []).append((stamp, parent, matrix))
+                    self._edges.setdefault(child, []).append((nanoseconds(transform.header.stamp), parent, matrix))
         self._edges |= static
         for entries in self._edges.values():
             entries.sort(key=itemgetter(0))
@@ -321,14 +317,14 @@ def _pose(position: Any, orientation: Any = None) -> list[float]:
     return [position.x, position.y, position.z, *turn]
 
 
-def _needle_pose(message: Any) -> list[list[float]]:
+def _needle_pose(message: Any) -> list[float]:
     """Return the pose in a message that holds one, however deep."""
     if hasattr(message, "transform"):
         if matrix_of(message.transform) is None:
             raise UnfitError("not a valid transform")
-        return [_pose(message.transform.translation, message.transform.rotation)]
+        return _pose(message.transform.translation, message.transform.rotation)
     pose = getattr(message.pose, "pose", message.pose)
-    return [_pose(pose.position, pose.orientation)]
+    return _pose(pose.position, pose.orientation)
 
 
 def _marker_poses(message: Any) -> list[list[float]]:
@@ -343,10 +339,7 @@ def _marker_poses(message: Any) -> list[list[float]]:
     return [[*point, *UPRIGHT] for point in _rotations(turn[None]).apply(points) + place]
 
 
-# By the type that a bag may have: what gives the poses in a message.
-_POSES: dict[str, Callable[[Any], list[list[float]]]] = dict.fromkeys(
-    (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"), _needle_pose
-)
+# By the type that a bag may have: what gives the points or poses of a thread in a message.
 _PATHS: dict[str, Callable[[Any], list[list[float]]]] = {
     PATH: lambda m: [_pose(stamped.pose.position, stamped.pose.orientation) for stamped in m.poses],
     "geometry_msgs/msg/PoseArray": lambda m: [_pose(pose.position, pose.orientation) for pose in m.poses],
@@ -354,13 +347,9 @@ _PATHS: dict[str, Callable[[Any], list[list[float]]]] = {
     "visualization_msgs/msg/Marker": _marker_poses,
     "magnetosuture_msgs/msg/PredictedThread": lambda m: [_pose(point) for point in m.positions],
 }
-CONVERTED = {
-    POSE: tuple(_POSES),
-    POSE_WITH_COVARIANCE: tuple(_POSES),
-    PATH: tuple(_PATHS),
-    TWIST: (TWIST, UNSTAMPED_TWIST),
-}
-"""Types that a bag may have, by the type that our graph takes."""
+_POSES = (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry")
+# Types that a bag may have, by the type that our graph takes.
+CONVERTED = {POSE: _POSES, POSE_WITH_COVARIANCE: _POSES, PATH: tuple(_PATHS), TWIST: (TWIST, UNSTAMPED_TWIST)}
 
 
 def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -> bytes:
@@ -385,12 +374,11 @@ def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -
         if matrix is not None:  # else inf would make nan of its neighbours
             vectors = vectors @ matrix[:3, :3].T
         return pack("header float64[6]", stamp, vectors)
-    kind = message.__msgtype__
     if type_name == PATH:
-        poses = _moved(_PATHS[kind](message), matrix)
+        poses = _moved(_PATHS[message.__msgtype__](message), matrix)
         fields = [field for pose in poses for field in (stamp, pose)]
         return pack("header uint32" + " header float64[7]" * len(poses), stamp, len(poses), *fields)
-    (pose,) = _moved(_POSES[kind](message), matrix)
+    (pose,) = _moved([_needle_pose(message)], matrix)
     if type_name == POSE:
         return pack("header float64[7]", stamp, pose)
     covariance = np.reshape(getattr(getattr(message, "pose", None), "covariance", np.zeros(36)), (6, 6))

@@ -441,9 +441,7 @@ def chosen_source(recording: Recording, source: str) -> str:
         return "camera"
     if recording.counts.get(interface.NEEDLE_POSE.recorded) and source != "camera":
         return "poses"
-    for channel in (*interface.CAMERA.values(), interface.NEEDLE_POSE):
-        if channel.recorded in recording.unfit:
-            raise BagError(recording.path, recording.unfit[channel.recorded])
+    recording.refuse_unfit(*interface.CAMERA.values(), interface.NEEDLE_POSE)
     recording.require(interface.NEEDLE_POSE if source == "poses" else interface.COMPRESSED_IMAGE)
     raise BagError(recording.path, "holds camera frames on a topic that is not theirs")  # require says all else
 
@@ -476,10 +474,8 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     source = chosen_source(recording, selection.get("source", "auto"))
-    truth = interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL
-    for channel in (interface.MEASURED_THREAD, interface.NEEDLE_COMMAND, *truth):
-        if channel.recorded in recording.unfit:
-            raise BagError(path, recording.unfit[channel.recorded])
+    recording.refuse_unfit(interface.MEASURED_THREAD, interface.NEEDLE_COMMAND)
+    recording.refuse_unfit(interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL)
     left = recording.duration - start
     with TemporaryDirectory() as spare:
         setup = _setup_of(recording, selection.get("setup_name", ""), Path(spare), _scene_at(recording, start), log)
