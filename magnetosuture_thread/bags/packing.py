@@ -577,7 +577,7 @@ def packed_thread_markers(
     width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
     friction = UNKNOWN if margins is None else margins.friction
     colour, nodes = friction_colour(friction), thread.positions
-    spheres, squeezed = (2.0 * width,) * 3, nodes[list(friction.nodes)]
+    spheres, squeezed = (2.0 * width, 2.0 * width, 2.0 * width), nodes[list(friction.nodes)]
     markers = [_line("thread", 0, width, colour, nodes)]
     markers.append(Marker("thread", 1, MarkerType.SPHERE_LIST, spheres, colour, points=squeezed))
     of_segments = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
@@ -594,10 +594,10 @@ def packed_thread_markers(
             markers.append(_line("predicted", 0, 0.4 * width, COLOURS["predicted"], prediction.positions, 0.9))
         for number, force in enumerate(estimate.disturbances):  # an arrow of 2.5 mm whose head is where the force acts
             arrow = np.array([force.position - 2.5e-3 * force.direction, force.position])
-            scale, place = (0.4 * width, 1.6 * width, 1.6 * width), force.position - 3.25e-3 * force.direction
-            name, colour = "disturbances", COLOURS["alarm"]
-            head = Marker(name, 2 * number, MarkerType.ARROW, scale, colour, points=arrow, lifetime=LIFETIME)
-            markers += [head, _text(name, 2 * number + 1, "alarm", place, str(force))]
+            scale, name, red = (0.4 * width, 1.6 * width, 1.6 * width), "disturbances", COLOURS["alarm"]
+            markers.append(Marker(name, 2 * number, MarkerType.ARROW, scale, red, points=arrow, lifetime=LIFETIME))
+            behind = force.position - 3.25e-3 * force.direction
+            markers.append(_text(name, 2 * number + 1, "alarm", behind, str(force)))
     return packed_markers(stamp, markers)
 
 

@@ -160,9 +160,9 @@ class GraphCollector:
 def _estimate(message: Any) -> EstimatedThread:
     disturbances = []
     for contact in message.disturbances:
-        stretch, force = (contact.arc_length, contact.extent), (contact.force, contact.significance)
-        place, since = map(_in_plane, (contact.position, contact.direction)), nanoseconds(contact.since) * 1e-9
-        disturbances.append(Disturbance(*stretch, *place, *force, since))
+        place, direction, since = contact.position, contact.direction, nanoseconds(contact.since) * 1e-9
+        vectors, force = (_in_plane(place), _in_plane(direction)), (contact.force, contact.significance)
+        disturbances.append(Disturbance(contact.arc_length, contact.extent, *vectors, *force, since))
     degrees, vertices = int(message.innovation_degrees), _points(message.positions)
     squared = np.full(degrees, message.innovation_squared / max(degrees, 1))
     return EstimatedThread(vertices, not message.prediction_only, squared, tuple(disturbances), message.hidden)

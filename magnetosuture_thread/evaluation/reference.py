@@ -233,8 +233,9 @@ def score(
     def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
         thread, paper = reference_thread(reference, path, segments)
         workspace = Workspace(reference.discs, 3e-3)  # m; within this of an obstacle, depths are looked at
-        names = {"formulation": formulation, "solver": solver}
-        predictor = ThreadPredictor(thread, workspace, **names, paper=paper, residual_tolerance=1e-6)
+        predictor = ThreadPredictor(
+            thread, workspace, formulation=formulation, solver=solver, paper=paper, residual_tolerance=1e-6
+        )
         predictor.warm_up()
         headings = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
         poses = [NeedlePose(*pose) for pose in zip(reference.times, reference.tails, headings, strict=True)]
@@ -260,7 +261,11 @@ def _score_each(
     """Score trajectories one after another; progress is called with the share of all that is done."""
     scores = []
     for index, path in enumerate(paths):
-        result = score_case(read_reference(path), path, lambda part, done=index: progress((done + part) / len(paths)))
+
+        def share(part: float, done: int = index) -> None:
+            progress((done + part) / len(paths))
+
+        result = score_case(read_reference(path), path, share)
         scores.append(result.score)
         keep(result)
     return tuple(scores)
@@ -395,7 +400,8 @@ def _rig_thread(trajectory: ReferenceTrajectory, path: Path, segments: int) -> T
         joint = NeedleJoint(trajectory.metadata["boundary"])
     if not all(math.isfinite(value) and value > 0.0 for value in values):
         raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
-    return ThreadProperties(values[0], segments, *values[1:5], joint, diameter=values[5])
+    length, bending, stretching, across, along, diameter = values
+    return ThreadProperties(length, segments, bending, stretching, across, along, joint, diameter)
 
 
 def reference_thread(
