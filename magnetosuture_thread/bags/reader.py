@@ -357,7 +357,7 @@ class Bag:
         first = self.start + round(start * 1e9)
         last = self.end if duration is None else first + round(duration * 1e9)
         parts = []
-        for file in self._files:
+        for file in sorted(self._files, key=lambda file: file.start):
             numbers = [number for number, c in file.connections.items() if self._names[c.topic] in topics]
             if numbers:
                 parts.append((file.start, file.messages(numbers, first, last)))

@@ -8,7 +8,8 @@ import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from heapq import heapify, heappop, heapreplace
+from heapq import heappop, heappush, heapreplace
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
@@ -217,20 +218,20 @@ def merge_by_time(parts: Iterable[tuple[int, Iterator[StoredMessage]]]) -> Itera
     """Yield the messages of all parts by time; of parts that do not overlap, one is in memory at a time.
 
     Args:
-        parts: a time that no message of the part is before, and its messages by time.
+        parts: a time that no message of the part is before, by which they are sorted, and its messages by time.
     """
-    heap: list[tuple[int, int, StoredMessage | None, Iterator[StoredMessage]]]
-    heap = [(start, number, None, messages) for number, (start, messages) in enumerate(parts)]
-    heapify(heap)
-    while heap:
-        _, number, message, messages = heap[0]
-        if message is not None:
-            yield message
-        following = next(messages, None)
-        if following is None:
-            heappop(heap)
-        else:
-            heapreplace(heap, (following.time, number, following, messages))
+    heap: list[tuple[float, int, StoredMessage | None, Iterator[StoredMessage]]] = []
+    end: tuple[float, Iterator[StoredMessage]] = (math.inf, iter(()))
+    for number, (start, messages) in enumerate(chain(parts, [end])):
+        while heap and heap[0][0] < start:  # what comes before anything of this part
+            _, part, message, following = heap[0]
+            if message is not None:
+                yield message
+            if (message := next(following, None)) is None:
+                heappop(heap)
+            else:
+                heapreplace(heap, (message.time, part, message, following))
+        heappush(heap, (start, number, None, messages))
 
 
 def unpack_zstd(data: bytes, size: int = MAX_RECORD_BYTES) -> bytes:
