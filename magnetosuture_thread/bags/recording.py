@@ -417,9 +417,9 @@ class TopicReport:
 
     topic: str
     types: tuple[str, ...]
-    channel: Channel | None = None
-    known: bool = False
-    problem: str = ""
+    channel: Channel | None
+    known: bool
+    problem: str
     times: array[float] = field(default_factory=lambda: array("d"))
     stamps: array[int] = field(default_factory=lambda: array("q"))
     unreadable: int = 0
@@ -428,8 +428,7 @@ class TopicReport:
     def add(self, record: RecordedMessage, time: float, serialization: str, recording: Recording) -> None:
         """Add a message that was recorded at a time [s since the bag's start]; try to use it until one can be used."""
         self.times.append(time)
-        problem = f"they are written as {serialization!r}, expected {CDR!r}" if serialization != CDR else ""
-        if not problem and record.decoder.has_header():
+        if serialization == CDR and record.decoder.has_header():
             try:
                 stamp, frame = stamp_and_frame(record.topic, record.data)
                 self.stamps.append(stamp)
@@ -438,14 +437,14 @@ class TopicReport:
                 self.unreadable += 1
         if self.channel is None or self.known:
             return
-        if not problem:
-            try:
-                recording.convert(record, self.channel).decode()
-            except (UnfitError, BagError) as error:
-                problem = error.problem if isinstance(error, BagError) else str(error)
-        self.known = not problem
-        reason = f"none of the messages on {self.topic} can be used: {problem}"
-        self.problem = "" if self.known else self.problem or reason
+        try:
+            if serialization != CDR:
+                raise UnfitError(f"they are written as {serialization!r}, expected {CDR!r}")
+            recording.convert(record, self.channel).decode()
+            self.known, self.problem = True, ""
+        except (UnfitError, BagError) as error:
+            reason = error.problem if isinstance(error, BagError) else error
+            self.problem = self.problem or f"none of the messages on {self.topic} can be used: {reason}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the report in SI units; null where there is no value."""
