@@ -45,8 +45,11 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; 
 _MIN_PRIVATE_OPCODE = 0x80
 _MAX_DEFINITION_BYTES = _WINDOW_BYTES = 1 << 22  # of a record that is no message or chunk; searched or read at a time
 # A chunk: opcode, length of less than a terabyte, times, size and checksum, a known compression; or the data's end.
-_CHUNK = rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
-_CHUNK_OR_END = re.compile(_CHUNK + rb"|\x0f\x04\0{7}.{4}[\x02-\x04\x08\x0a\x0b\x0d].{5}\0{3}", re.DOTALL)
+_CHUNK_OR_END = re.compile(
+    rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
+    rb"|\x0f\x04\0{7}.{4}[\x02-\x04\x08\x0a\x0b\x0d].{5}\0{3}",
+    re.DOTALL,
+)
 _lz4: Any = import_module("lz4.frame")  # which has no types
 
 

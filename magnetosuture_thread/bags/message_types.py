@@ -22,9 +22,6 @@ from magnetosuture_thread.settings.files import share_directory
 
 Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 
-MAX_ELEMENTS = 4_000  # fields that a message has whatever its data, all nested ones counted: a decoder is made for each
-MAX_DECODED = 1_000_000  # objects that the data of one message may become
-
 
 @cache
 def typestore() -> Typestore:
@@ -86,8 +83,8 @@ class MessageDecoder:
         Raises:
             BagError: the bytes are not of the type, or the type has no definition.
         """
-        if len(data) * self._density > MAX_DECODED:
-            raise BagError(topic, f"a message of {len(data)} bytes may have more than {MAX_DECODED} parts")
+        if len(data) * self._density > 1_000_000:  # objects that it may become
+            raise BagError(topic, f"a message of {len(data)} bytes may have more than 1000000 parts")
         if not self.is_known:
             problem = self._problem or "no definition"
             raise BagError(topic, f"the type {self.type_name or '(no name)'} of its messages has {problem}")
@@ -224,6 +221,6 @@ def _extent(kind: Any, types: Types, depth: int = 0) -> tuple[int, int, float]:
             raise BagError("", "a definition with a sequence of parts that hold nothing")
         else:
             objects, size, density = 1, 4, density if is_numbers else max(density, objects / size)
-    if not 0 <= objects <= MAX_ELEMENTS:
-        raise BagError("", f"a definition of more than {MAX_ELEMENTS} fields, nested ones counted")
+    if not 0 <= objects <= 4_000:  # for each, whatever the data, a decoder is made
+        raise BagError("", "a definition of more than 4000 fields, nested ones counted")
     return objects, size, density
