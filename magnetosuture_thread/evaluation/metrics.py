@@ -448,6 +448,14 @@ class RunMetrics:
         self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
         self._worst: dict[str, WorstFrame] = {}
 
+    @classmethod
+    def of(cls, length: float, frames: Iterable[FrameResult], start: int = 0) -> RunMetrics:
+        """Return the figures of frames by time."""
+        metrics = cls(length, start)
+        for frame in frames:
+            metrics.add(frame)
+        return metrics
+
     def observe(self, observation: frames.Observation) -> None:
         """Count a frame, or a recorded pose, and whether its needle was found."""
         columns = {"processing": observation.processing, "tracked": float(observation.found)}

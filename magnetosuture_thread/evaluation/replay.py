@@ -20,10 +20,9 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import WAITING
 from magnetosuture_thread.evaluation import recorded
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
-from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary, figures_of
 from magnetosuture_thread.evaluation.metrics import TARGETS, Percentiles, RunMetrics, SensorSilence, finite_or_none
 from magnetosuture_thread.evaluation.recorded import BagInput, Event, Step, TrackedFrame
-from magnetosuture_thread.evaluation.tables import STAGES
+from magnetosuture_thread.evaluation.tables import STAGES, ReplaySummary, figures_of
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError, InvalidInputError
