@@ -31,7 +31,6 @@ from magnetosuture_thread.bags.packing import (
     packed_thread_markers,
     prediction_outputs,
 )
-from magnetosuture_thread.bags.reading import header_stamp
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import WAITING, PredictionResult, ThreadSession
@@ -171,7 +170,7 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
 
     def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], take: Callable[..., Any]) -> None:
         """Take a message about the thread; without an estimate most are not needed, and only their stamp is read."""
-        stamp = header_stamp(data) or 0
+        stamp = reading.header_stamp(data) or 0
         if self._session.estimates or self._session.needs_measured_thread(stamp):
             try:
                 self._report_all(take(stamp, read(topic.decode(data))))
