@@ -221,7 +221,7 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
     By the senders' stamps: when we hear of it does not matter to the coils. A command that got lost on its way to us
     is known by the needle command that followed from it, which keeps its stamp.
     """
-    from magnetosuture_thread.bags.cdr import header_stamp
+    from magnetosuture_thread.bags.reading import header_stamp
     from magnetosuture_thread.nodes import topics
     from magnetosuture_thread.nodes.clients import Recorder
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment

@@ -20,13 +20,11 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
-from magnetosuture_thread.bags.cdr import pack
-from magnetosuture_thread.bags.check import write_repaired_bag
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import packed_path, packed_pose
+from magnetosuture_thread.bags.packing import pack, packed_path, packed_pose
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import METADATA_FILE
-from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.bags.writer import BagWriter, write_repaired_bag
 from magnetosuture_thread.settings.errors import MagnetosutureError
 
 MAX_SECONDS, MAX_MEGABYTES = 5.0, 300.0

@@ -17,52 +17,39 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import zstandard
-from mcap import records as mcap_records
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Channel, DataEnd, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from magnetosuture_thread.bags.storage import (
-    MAX_RECORD_BYTES,
-    NOTES,
-    Budget,
-    Connection,
-    CorruptRegion,
-    DamageReport,
-    MessageDefinition,
-    StoredMessage,
-    merge_by_time,
-    open_file,
-    pluralize,
-    verified_notes,
-)
+from magnetosuture_thread.bags import storage
+from magnetosuture_thread.bags.storage import Budget, Connection, CorruptRegion, DamageReport, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
-MAX_DEFINITION_BYTES = 1 << 22  # of a record that is neither a message nor a chunk; in memory it takes 20 times as much
 _RECORD = struct.Struct("<BQ")  # opcode and length of the content
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
-_CHUNK_HEAD_BYTES = 40  # of its content: times, size, checksum, lengths of the compression's name and of the records
 _MIN_PRIVATE_OPCODE = 0x80
-_UNREAD = (Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT)
-_WINDOW_BYTES = 1 << 22  # searched or read at a time
-_RUN_BYTES = 1 << 20  # of messages outside of chunks that are read at a time
-_RECORD_COST = 5  # of a record outside of chunks, which takes the time of so many within
+_MAX_DEFINITION_BYTES = _WINDOW_BYTES = 1 << 22  # of a record that is no message or chunk; searched or read at a time
 # A chunk: opcode, length of less than a terabyte, times, size and checksum, a known compression; or the data's end.
-_CHUNK = rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
-_CHUNK_OR_END = re.compile(_CHUNK + rb"|\x0f\x04\0{7}.{4}[\x02-\x04\x08\x0a\x0b\x0d].{5}\0{3}", re.DOTALL)
-_PATTERN_BYTES = 64  # more than a match
+_CHUNK_OR_END = re.compile(
+    rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
+    rb"|\x0f\x04\0{7}.{4}[\x02-\x04\x08\x0a\x0b\x0d].{5}\0{3}",
+    re.DOTALL,
+)
 _lz4: Any = import_module("lz4.frame")  # which has no types
 
 
@@ -70,33 +57,35 @@ class CorruptError(Exception):
     """Bytes that are no valid record; the text gives the reason."""
 
 
-def split_records(read: Callable[[int, int], bytes], position: int, size: int) -> Iterator[tuple[int, int, int, bytes]]:
+def split_records(
+    read: Callable[[int, int], bytes], size: int, position: int = 0
+) -> Iterator[tuple[int, int, int, bytes]]:
     """Yield opcode, start and end of each record from a position on, and its first bytes.
 
     Args:
         read: returns the bytes from a position to another.
-        position: where the first record begins.
-        size: where the last one ends.
+        size: where the last record ends.
+        position: where the first one begins.
 
     Raises:
         CorruptError: a record is longer than the rest or than it may be, or none.
     """
     while position < size:
         head = read(position, position + _RECORD.size + _MESSAGE.size)
-        opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
+        opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, size)
         end = position + _RECORD.size + length
         if end > size:
             raise CorruptError("it is truncated or corrupt")
         if opcode == Opcode.MESSAGE:
-            is_odd = not _MESSAGE.size <= length <= MAX_RECORD_BYTES
+            is_valid = _MESSAGE.size <= length <= storage.MAX_RECORD_BYTES
         elif opcode == Opcode.MESSAGE_INDEX:
-            is_odd = int.from_bytes(head[11:15], "little") != length - 6
+            is_valid = int.from_bytes(head[11:15], "little") == length - 6
         elif opcode == Opcode.ATTACHMENT or opcode >= _MIN_PRIVATE_OPCODE:
-            is_odd = False
+            is_valid = True
         else:
-            most = MAX_RECORD_BYTES if opcode == Opcode.CHUNK else MAX_DEFINITION_BYTES
-            is_odd = not Opcode.HEADER <= opcode <= Opcode.DATA_END or length > most
-        if is_odd:
+            most = storage.MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _MAX_DEFINITION_BYTES
+            is_valid = Opcode.HEADER <= opcode <= Opcode.DATA_END and length <= most
+        if not is_valid:
             raise CorruptError("no record where one is expected")
         yield opcode, position, end, head
         position = end
@@ -134,15 +123,15 @@ def unpack_chunk(record: bytes, budget: Budget | None = None) -> tuple[bytes, bo
     """
     chunk = parse_record(record)
     size, data = chunk.uncompressed_size, chunk.data
-    begin = _RECORD.size + _CHUNK_HEAD_BYTES + len(chunk.compression)
-    # The package reads what there is.
-    if size > MAX_RECORD_BYTES or record[begin - 8 : begin] != (len(record) - begin).to_bytes(8, "little"):
+    # Behind times, size, checksum, compression and length of the records; the package reads what there is.
+    begin = _RECORD.size + 40 + len(chunk.compression)
+    if size > storage.MAX_RECORD_BYTES or record[begin - 8 : begin] != (len(record) - begin).to_bytes(8, "little"):
         raise CorruptError(f"a chunk of {size} bytes, or of a wrong length")
     if budget is not None:
         budget.spend("unpacked bytes", len(record) + size)
     try:
         if chunk.compression == "zstd" and zstandard.frame_content_size(data) in (-1, size):  # -1: not known
-            data = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).decompress(data, max_output_size=size)
+            data = storage.unpack_zstd(data, size)
         elif chunk.compression == "lz4":
             data = _lz4.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif chunk.compression:
@@ -187,18 +176,16 @@ class Block:
 
 def connections_of(definitions: Iterable[Any]) -> dict[int, Connection]:
     """Return the channels whose definition, and that of their schema, is without conflict."""
-    schemas: dict[int, Any] = {0: mcap_records.Schema(0, b"", "", "")}
+    schemas: dict[int, Any] = {0: Schema(0, b"", "", "")}
     channels: dict[int, Any] = {}
     for record in definitions:
-        table = schemas if isinstance(record, mcap_records.Schema) else channels
+        table = schemas if isinstance(record, Schema) else channels
         if table.setdefault(record.id, record) != record:
             table[record.id] = None
     known: dict[int, Connection] = {}
     for number, channel in channels.items():
-        schema = schemas.get(channel.schema_id) if channel is not None else None
-        if schema is not None:
-            text = schema.data.decode("utf-8", "surrogateescape")
-            definition = MessageDefinition(schema.name, schema.encoding, text)
+        if channel is not None and (schema := schemas.get(channel.schema_id)) is not None:
+            definition = MessageDefinition(schema.name, schema.encoding, schema.data.decode("utf-8", "surrogateescape"))
             known[number] = Connection(channel.topic, definition, channel.message_encoding, channel.metadata)
     return known
 
@@ -234,22 +221,21 @@ class McapFile:
         self.path = path
         self.damage: DamageReport | None = None
         self.others: Counter[str] = Counter()
+        self.connections: dict[int, Connection] = {}
+        self.counts: Counter[int] = Counter()
         self._budget = budget
         self._blocks: list[Block] = []
         self._regions: list[CorruptRegion] = []
-        self._definitions: dict[bytes, Any] = {}  # by the bytes of their records, of chunks with a checksum
-        self._loose_definitions: list[Any] = []
-        self._metadata: list[mcap_records.Metadata] = []
+        # By the bytes of their records.
+        self._definitions: dict[str, dict[bytes, Any]] = {"verified": {}, "loose": {}, "summary": {}}
+        self._metadata: list[Metadata] = []
+        self._statistics: Statistics | None = None
         self._data_end = self._data_crc = 0  # where the data section ends, 0 where that is not known; its checksum
-        self._is_verified = False  # by the latter
-        self._summary_definitions: list[Any] = []
-        self._statistics: mcap_records.Statistics | None = None
-        self._has_footer = self._is_trusted = False  # the latter: the summary, by its checksum
+        self._is_verified = self._is_trusted = False  # the data by its checksum; the summary by its own
         try:
-            with open_file(path) as stream:
+            with storage.open_file(path) as stream:
                 size = stream.seek(0, 2)
-                stream.seek(0)
-                head = stream.read(HEAD_BYTES)
+                head = read_range(stream, 0, HEAD_BYTES)
                 if not size:
                     raise BagError(path, "is empty, expected an mcap file")
                 is_indexed = is_url(path) and self._read_index(stream, size)
@@ -270,16 +256,17 @@ class McapFile:
         if not self._is_verified and verified < len(self._blocks):
             what = "has messages without a checksum: damage to them" if verified else "has no checksums: damage to it"
             self.has_no_checksum = f"{what} cannot be noticed"
-        notes = (verified_notes(r.metadata, data_verified=self._is_verified) for r in self._metadata if r.name == NOTES)
+        records = [record.metadata for record in self._metadata if record.name == storage.NOTES]
+        notes = (storage.verified_notes(entries, data_verified=self._is_verified) for entries in records)
         self.notes = next((entries for entries in notes if entries is not None), {})
-        self.others["metadata record"] = sum(record.name not in (NOTES, "rosbag2") for record in self._metadata)
+        self.others["metadata record"] = sum(record.name not in (storage.NOTES, "rosbag2") for record in self._metadata)
         self.others = +self.others  # without those that there are none of
         chunks = sum(block.is_chunk for block in self._blocks)
         data = "; of all data too" if self._is_verified else ", verified as they are read" if is_indexed else ""
-        checksums = f"of {verified} of {pluralize(chunks, 'chunk')}{data}"
+        checksums = f"of {verified} of {storage.pluralize(chunks, 'chunk')}{data}"
         self.facts = {"format": "mcap", "bytes": str(size), "chunks": str(chunks), "checksums": checksums}
 
-    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[storage.StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
@@ -287,9 +274,9 @@ class McapFile:
         """
         wanted = frozenset(connections) & set(self.counts)
         try:
-            with open_file(self.path) as stream:
-                yield from merge_by_time(
-                    (block.start, partial(self._read_block, stream, block, wanted, start, end))
+            with storage.open_file(self.path) as stream:
+                yield from storage.merge_by_time(
+                    (block.start, self._read_block(stream, block, wanted, start, end))
                     for block in self._blocks
                     if block.start <= end and block.end >= start and not wanted.isdisjoint(block.counts)
                 )
@@ -298,15 +285,15 @@ class McapFile:
 
     def _read_block(
         self, stream: BinaryIO, block: Block, wanted: frozenset[int], start: int, end: int
-    ) -> Iterator[StoredMessage]:
+    ) -> Iterator[storage.StoredMessage]:
         messages = []
         try:
             data = read_range(stream, block.offset, block.offset + block.length)
             if block.is_chunk:
                 data, has_checksum = unpack_chunk(data)
-                if (block.crc is None and not has_checksum) or block.crc not in (None, zlib.crc32(data)):
+                if not has_checksum if block.crc is None else block.crc != zlib.crc32(data):
                     raise CorruptError("a chunk without a checksum, or other bytes than before")
-            for opcode, first, last, head in split_records(lambda start, end: data[start:end], 0, len(data)):
+            for opcode, first, last, head in split_records(lambda start, end: data[start:end], len(data)):
                 if opcode == Opcode.MESSAGE:
                     channel, sequence, time, publish_time = _MESSAGE.unpack_from(head, _RECORD.size)
                     if channel in wanted and start <= time <= end:
@@ -314,9 +301,8 @@ class McapFile:
         except CorruptError as error:
             problem = f"has {error} at byte {block.offset}; `bag check` of a copy tells what is intact"
             raise BagError(self.path, problem) from None
-        messages.sort()
-        for time, first, last, channel, sequence, publish_time in messages:
-            yield StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
+        for time, first, last, channel, sequence, publish_time in sorted(messages):
+            yield storage.StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
 
     def _read_index(self, stream: BinaryIO, size: int) -> bool:
         """Take what the file holds from its summary; return whether that tells it, so that it need not be scanned."""
@@ -325,108 +311,105 @@ class McapFile:
             summary = make_reader(stream).get_summary()
             if summary is None or summary.statistics is None:
                 return False
-            metadata = []
-            for entry in summary.metadata_indexes:
-                length = min(entry.length, MAX_DEFINITION_BYTES)
-                metadata.append(parse_record(read_range(stream, entry.offset, entry.offset + length)))
-            stream.seek(-_RECORD.size - 20 - len(MAGIC), 2)
-            footer = parse_record(stream.read())
+            metadata = [
+                parse_record(read_range(stream, entry.offset, entry.offset + min(entry.length, _MAX_DEFINITION_BYTES)))
+                for entry in summary.metadata_indexes
+            ]
+            footer = parse_record(read_range(stream, size - _RECORD.size - 20 - len(MAGIC), size))
         except (McapError, CorruptError, struct.error, ValueError):
             return False
-        counts = {channel: count for channel, count in summary.statistics.channel_message_counts.items() if count}
-        connections = connections_of([*summary.schemas.values(), *summary.channels.values()])
+        statistics, chunks = summary.statistics, summary.chunk_indexes
+        self.counts = +Counter(statistics.channel_message_counts)
+        self.connections = connections_of([*summary.schemas.values(), *summary.channels.values()])
         if not (
-            footer.summary_crc != 0
-            and _crc(stream, footer.summary_start, size - len(MAGIC) - 4) == footer.summary_crc
-            and sum(counts.values()) == summary.statistics.message_count
-            and counts.keys() <= connections.keys()
-            and summary.statistics.chunk_count == len(summary.chunk_indexes) > 0
-            and all(index.message_index_offsets for index in summary.chunk_indexes)
+            _crc(stream, footer.summary_start, size - len(MAGIC) - 4) == footer.summary_crc != 0
+            and self.counts.total() == statistics.message_count
+            and self.counts.keys() <= self.connections.keys()
+            and statistics.chunk_count == len(chunks) > 0
+            and all(index.message_index_offsets for index in chunks)
         ):
             return False
-        for index in summary.chunk_indexes:
+        for index in chunks:
+            place, counts = (
+                (index.chunk_start_offset, index.chunk_length),
+                dict.fromkeys(index.message_index_offsets, 0),
+            )
             times = index.message_start_time, index.message_end_time
-            channels = dict.fromkeys(index.message_index_offsets, 0)
-            self._blocks.append(Block(index.chunk_start_offset, index.chunk_length, True, True, None, *times, channels))
-        self.counts, self.connections, self._metadata = Counter(counts), connections, metadata
-        self.others["attachment"] = summary.statistics.attachment_count
+            self._blocks.append(Block(*place, True, True, None, *times, counts))
+        self._metadata, self.others["attachment"] = metadata, statistics.attachment_count
         return True
 
     def _scan(self, stream: BinaryIO, size: int, progress: Callable[[int], None]) -> None:
         """Scan the file record by record; behind corrupt bytes, from the next intact place on."""
-        stream.seek(0)
         position = sound = len(MAGIC)  # the latter: where the last intact chunk, or the data section, ends
-        if stream.read(len(MAGIC)) != MAGIC:
-            self._regions.append(CorruptRegion(self.path.name, 0, len(MAGIC), "not the first bytes of an mcap file"))
+        has_footer = False
+        if read_range(stream, 0, len(MAGIC)) != MAGIC:
+            self._add_region("not the first bytes of an mcap file", 0, len(MAGIC))
         while position < size:
             before = position
             try:
-                for opcode, start, end, head in split_records(partial(read_range, stream), position, size):
+                for opcode, start, end, head in split_records(partial(read_range, stream), size, position):
                     self._add(stream, opcode, start, end, head)
                     position = end
-                    is_sound = opcode == Opcode.DATA_END or (opcode == Opcode.CHUNK and self._blocks[-1].has_checksum)
-                    sound = end if is_sound else sound
-                    if opcode == Opcode.FOOTER:
-                        self._end(stream, start, end, size)
-                        position = size
+                    if opcode == Opcode.DATA_END or (opcode == Opcode.CHUNK and self._blocks[-1].has_checksum):
+                        sound = end
+                    elif opcode == Opcode.FOOTER:
+                        self._verify_summary(stream, start, end, size)
+                        position, has_footer = size, True
                         break
             except CorruptError as error:
                 after = self._find_intact(stream, sound, size, position)
                 start = position if after > position else sound  # A corrupt length may lead past intact chunks.
-                time = self._blocks[-1].end if self._blocks else None
-                self._regions.append(CorruptRegion(self.path.name, start, after, str(error), time))
+                self._add_region(str(error), start, after, self._blocks[-1].end if self._blocks else None)
                 position = after
             progress(max(0, position - before))
-        if not self._has_footer and not any(region.end == size for region in self._regions):
-            time = self._blocks[-1].end if self._blocks else None
-            self._regions.append(CorruptRegion(self.path.name, size, size, "it is truncated", time))
+        if not has_footer and not any(region.end == size for region in self._regions):
+            self._add_region("it is truncated", size, size, self._blocks[-1].end if self._blocks else None)
+
+    def _add_region(self, what: str, start: int, end: int, first: int | None = None) -> None:
+        self._regions.append(CorruptRegion(self.path.name, start, end, what, first))
 
     def _add(self, stream: BinaryIO, opcode: int, start: int, end: int, head: bytes) -> None:
         """Add a record of the file."""
-        # An index comes with a message of its chunk: small chunks of many topics are mostly such indexes.
-        self._budget.spend("records", _RECORD_COST)
+        # A record outside of chunks takes the time of five within. An index comes with a message of its chunk: small
+        # chunks of many topics are mostly such indexes.
+        self._budget.spend("records", 5)
         self.others["attachment"] += opcode == Opcode.ATTACHMENT
         self.others["record of a private kind"] += opcode >= _MIN_PRIVATE_OPCODE
-        if opcode in _UNREAD or opcode >= _MIN_PRIVATE_OPCODE:
-            return
         if opcode == Opcode.MESSAGE:
             run = self._blocks[-1] if self._blocks else Block(0, 0)
-            if run.is_chunk or run.offset + run.length != start or run.length > _RUN_BYTES:
+            if run.is_chunk or run.offset + run.length != start or run.length > 1 << 20:  # bytes, read at a time
                 run = Block(start, 0)
                 self._blocks.append(run)
             run.length = end - run.offset
             run.add(head)
-            return
-        record = read_range(stream, start, end)
-        if opcode == Opcode.CHUNK:
-            self._add_chunk(record, start)
-            return
-        parsed = self._parse_and_keep(record)
-        if isinstance(parsed, mcap_records.DataEnd):
-            self._data_end, self._data_crc = end, parsed.data_section_crc
-            self._is_verified = self._data_crc != 0 and _crc(stream, 0, start) == self._data_crc
-        elif isinstance(parsed, mcap_records.Metadata):
-            self._metadata.append(parsed)
-        elif isinstance(parsed, mcap_records.Statistics):
-            self._statistics = parsed
-        elif isinstance(parsed, (mcap_records.Schema, mcap_records.Channel)):
-            (self._summary_definitions if self._data_end else self._loose_definitions).append(parsed)
+        elif opcode == Opcode.CHUNK:
+            self._add_chunk(read_range(stream, start, end), start)
+        elif opcode not in (Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT) and opcode < _MIN_PRIVATE_OPCODE:
+            record = read_range(stream, start, end)
+            match self._parse_and_keep(record):
+                case DataEnd(data_section_crc=crc):
+                    self._data_end, self._data_crc = end, crc
+                    self._is_verified = crc != 0 and _crc(stream, 0, start) == crc
+                case Metadata() as metadata:
+                    self._metadata.append(metadata)
+                case Statistics() as statistics:
+                    self._statistics = statistics
+                case Schema() | Channel() as definition:
+                    self._definitions["summary" if self._data_end else "loose"][record] = definition
 
     def _add_chunk(self, record: bytes, position: int) -> None:
         """Add a chunk and its definitions; nothing of it where a record is corrupt."""
         data, has_checksum = unpack_chunk(record, self._budget)
         block = Block(position, len(record), True, has_checksum, zlib.crc32(data))
         definitions = {}
-        for opcode, start, end, head in split_records(lambda start, end: data[start:end], 0, len(data)):
+        for opcode, start, end, head in split_records(lambda start, end: data[start:end], len(data)):
             self._budget.spend("records", 1)
             if opcode == Opcode.MESSAGE:
                 block.add(head)
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data[start:end] not in self._definitions:
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and data[start:end] not in self._definitions["verified"]:
                 definitions[data[start:end]] = self._parse_and_keep(data[start:end])
-        if has_checksum:
-            self._definitions |= definitions
-        else:
-            self._loose_definitions += definitions.values()
+        self._definitions["verified" if has_checksum else "loose"] |= definitions
         self._blocks.append(block)
 
     def _parse_and_keep(self, record: bytes) -> Any:
@@ -440,13 +423,12 @@ class McapFile:
         self._budget.spend("bytes of definitions", 2 * len(record) + 500 + 150 * len(entries))
         return parsed
 
-    def _end(self, stream: BinaryIO, start: int, end: int, size: int) -> None:
-        """Verify the summary by the footer, which is all that may be at the end of the file."""
+    def _verify_summary(self, stream: BinaryIO, start: int, end: int, size: int) -> None:
+        """Verify the summary by the footer, behind which only the magic may be."""
         footer, magic = parse_record(read_range(stream, start, end)), stream.read()
         self._is_trusted = _crc(stream, self._data_end, start + _RECORD.size + 16) == footer.summary_crc != 0
         if end != size - len(MAGIC) or magic != MAGIC or not (self._is_trusted or footer.summary_crc == 0):
             raise CorruptError("a summary or an end with a wrong checksum")
-        self._has_footer = True
 
     def _find_intact(self, stream: BinaryIO, position: int, size: int, corrupt: int) -> int:
         """Return where the next chunk with a correct checksum, or the end of the data, begins; the size if nowhere.
@@ -460,72 +442,75 @@ class McapFile:
             corrupt: where none begins.
         """
         while position < size:
-            stream.seek(position)
-            window = stream.read(_WINDOW_BYTES)
+            window = read_range(stream, position, position + _WINDOW_BYTES)
             self._budget.spend("unpacked bytes", len(window))
             for match in _CHUNK_OR_END.finditer(window):
                 at = position + match.start()
                 opcode, length = _RECORD.unpack_from(window, match.start())
-                if at == corrupt or length > min(MAX_RECORD_BYTES, size - at):
+                if at == corrupt or length > min(storage.MAX_RECORD_BYTES, size - at):
                     continue
-                if opcode == Opcode.DATA_END:
-                    return at
-                try:
-                    if unpack_chunk(read_range(stream, at, at + _RECORD.size + length), self._budget)[1]:
+                record = read_range(stream, at, at + _RECORD.size + length)
+                with suppress(CorruptError):
+                    if opcode == Opcode.DATA_END or unpack_chunk(record, self._budget)[1]:
                         return at
-                except CorruptError:
-                    continue
-            position += max(1, len(window) - _PATTERN_BYTES)
+            position += max(1, len(window) - 64)  # more than a match
         return size
 
     def _salvage(self, size: int) -> None:
         """Keep the blocks that can be used, and set connections, counts and damage."""
-        name, statistics, regions = self.path.name, self._statistics, self._regions
+        statistics, regions = self._statistics, self._regions
         corrupt_bytes = sum(region.end - region.start for region in regions)
         is_private = self.others["record of a private kind"] > 0
-        is_scanned = not is_private and self._data_end > 0 and all(r.start >= self._data_end for r in regions)
-        is_scanned = is_scanned or self._is_verified
-        chunks = [block for block in self._blocks if block.is_chunk]
+        is_whole = not is_private and self._data_end > 0 and all(r.start >= self._data_end for r in regions)
+        is_scanned = is_whole or self._is_verified
         # A recorder does not write the same messages with the same times again, but a copy of a part of a file does.
-        is_odd = regions or statistics is None or _contradiction(statistics, self._blocks, _count(self._blocks))
+        is_odd = regions or statistics is None or _contradiction(statistics, self._blocks)
         if is_odd and not self._is_verified:
+            chunks = [block for block in self._blocks if block.is_chunk]
             once = {(block.crc, block.start, block.end): block for block in reversed(chunks)}
             copies = [block for block in chunks if once[block.crc, block.start, block.end] is not block]
             self._blocks = [block for block in self._blocks if block not in copies]
-            regions += [_region(name, [block], "a second copy of a chunk") for block in copies]
-        scanned = _count(self._blocks)
-        if not regions and statistics is not None and (problem := _contradiction(statistics, self._blocks, scanned)):
-            regions.append(CorruptRegion(name, self._data_end, size, problem))
+            for block in copies:
+                self._add_region("a second copy of a chunk", *_extent([block]))
+        scanned = _count(self._blocks).total()
+        if not regions and statistics is not None and (problem := _contradiction(statistics, self._blocks)):
+            self._add_region(problem, self._data_end, size)
             is_scanned = False
-        if not regions and self._data_crc and not self._is_verified:
-            regions.append(CorruptRegion(name, 0, size, "data other than messages does not match its checksum"))
-        if not regions and statistics is None and not self._is_verified and is_private:
-            regions.append(CorruptRegion(name, 0, size, "records of a private kind, which may be corrupt others"))
+        if not regions and not self._is_verified and self._data_crc:
+            self._add_region("data other than messages does not match its checksum", 0, size)
+        if not regions and not self._is_verified and statistics is None and is_private:
+            self._add_region("records of a private kind, which may be corrupt others", 0, size)
         is_sound = self._is_verified or not regions
         loose = [block for block in self._blocks if not block.has_checksum]
         if loose and not is_sound:
             self._blocks = [block for block in self._blocks if block.has_checksum]
-            what = f"{pluralize(_count(loose).total(), 'message')} without a checksum, which may be wrong"
-            regions.append(_region(name, loose, what))
-        definitions = [*self._definitions.values(), *(self._loose_definitions if is_sound else ())]
-        self.connections = connections_of([*definitions, *(self._summary_definitions if self._is_trusted else ())])
+            count = storage.pluralize(_count(loose).total(), "message")
+            self._add_region(f"{count} without a checksum, which may be wrong", *_extent(loose))
+        usable = {"verified": True, "loose": is_sound, "summary": self._is_trusted}
+        definitions = (table.values() for kind, table in self._definitions.items() if usable[kind])
+        self.connections = connections_of(chain.from_iterable(definitions))
         self.counts = _count(self._blocks)
         for channel in sorted(self.counts.keys() - self.connections.keys()):
             block = next(block for block in self._blocks if channel in block.counts)
-            what = f"{pluralize(self.counts.pop(channel), 'message')} of a channel without a definition, or with two"
-            regions.append(_region(name, [block], what))
-        if not regions:
-            return
-        used, lost = self.counts.total(), scanned.total() - self.counts.total() if is_scanned else None
-        lost_chunks = sum("chunk" in region.what for region in regions)
+            count = storage.pluralize(self.counts.pop(channel), "message")
+            self._add_region(f"{count} of a channel without a definition, or with two", *_extent([block]))
+        if regions:
+            self._report_damage(corrupt_bytes, scanned if is_scanned else None)
+
+    def _report_damage(self, corrupt_bytes: int, scanned: int | None) -> None:
+        """Set the damage: what the summary claims and is not used, else what was scanned and is not."""
+        used, statistics = self.counts.total(), self._statistics
+        lost = None if scanned is None else scanned - used
+        lost_chunks = sum("chunk" in region.what for region in self._regions)
         if statistics is not None and self._is_trusted:
             lost = max(0, statistics.message_count - used)
             lost_chunks = max(0, statistics.chunk_count - sum(block.is_chunk for block in self._blocks))
-        for number, region in enumerate(regions):
+        regions = []
+        for region in sorted(self._regions, key=lambda region: region.start):
             following = next((block.start for block in self._blocks if block.offset >= region.end), None)
-            times = (None, None) if lost == 0 else (region.first, following)
-            regions[number] = replace(region, first=times[0], last=times[1])
-        self.damage = DamageReport(tuple(sorted(regions, key=lambda r: r.start)), lost_chunks, corrupt_bytes, lost)
+            first, last = (None, None) if lost == 0 else (region.first, following)
+            regions.append(replace(region, first=first, last=last))
+        self.damage = DamageReport(tuple(regions), lost_chunks, corrupt_bytes, lost)
 
 
 def _count(blocks: Iterable[Block]) -> Counter[int]:
@@ -536,9 +521,9 @@ def _count(blocks: Iterable[Block]) -> Counter[int]:
     return counts
 
 
-def _region(name: str, blocks: list[Block], what: str) -> CorruptRegion:
-    """Return the region from the first of some blocks to the last."""
-    return CorruptRegion(name, blocks[0].offset, blocks[-1].offset + blocks[-1].length, what)
+def _extent(blocks: list[Block]) -> tuple[int, int]:
+    """Return where the first of some blocks begins in the file, and where the last one ends."""
+    return blocks[0].offset, blocks[-1].offset + blocks[-1].length
 
 
 def _crc(stream: BinaryIO, start: int, end: int) -> int:
@@ -550,8 +535,9 @@ def _crc(stream: BinaryIO, start: int, end: int) -> int:
     return crc
 
 
-def _contradiction(statistics: mcap_records.Statistics, blocks: list[Block], counts: Counter[int]) -> str:
+def _contradiction(statistics: Statistics, blocks: list[Block]) -> str:
     """Return how a summary contradicts the messages; empty if it does not."""
+    counts = _count(blocks)
     start = min((block.start for block in blocks if block.counts), default=0)
     end = max((block.end for block in blocks if block.counts), default=statistics.message_end_time)
     is_same = statistics.message_count == counts.total()
@@ -559,5 +545,5 @@ def _contradiction(statistics: mcap_records.Statistics, blocks: list[Block], cou
     # Some writers take a start of 0 ns for none, and the next time for it.
     if is_same and end == statistics.message_end_time and start in (0, statistics.message_start_time):
         return ""
-    number = pluralize(statistics.message_count, "message")
+    number = storage.pluralize(statistics.message_count, "message")
     return f"its summary claims {number}, and other counts or times than the {counts.total()} that it holds"

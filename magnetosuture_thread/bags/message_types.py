@@ -22,21 +22,15 @@ from magnetosuture_thread.settings.files import share_directory
 
 Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 
-HEADER = "std_msgs/msg/Header"
-MAX_DEFINITION_CHARS = 200_000
-MAX_NESTING = 32  # of message types in each other
-MAX_ELEMENTS = 4_000  # fields that a message has whatever its data, all nested ones counted: a decoder is made for each
-MAX_DECODED = 1_000_000  # objects that the data of one message may become
-
 
 @cache
 def typestore() -> Typestore:
     """Return the types of ROS 2 Jazzy and of magnetosuture_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    own = {}
+    types = {}
     for path in sorted((share_directory("magnetosuture_msgs") / "msg").glob("*.msg")):
-        own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"magnetosuture_msgs/msg/{path.stem}"))
-    store.register(own)
+        types.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"magnetosuture_msgs/msg/{path.stem}"))
+    store.register(types)
     return store
 
 
@@ -89,8 +83,8 @@ class MessageDecoder:
         Raises:
             BagError: the bytes are not of the type, or the type has no definition.
         """
-        if len(data) * self._density > MAX_DECODED:
-            raise BagError(topic, f"a message of {len(data)} bytes may have more than {MAX_DECODED} parts")
+        if len(data) * self._density > 1_000_000:  # objects that it may become
+            raise BagError(topic, f"a message of {len(data)} bytes may have more than 1000000 parts")
         if not self.is_known:
             problem = self._problem or "no definition"
             raise BagError(topic, f"the type {self.type_name or '(no name)'} of its messages has {problem}")
@@ -102,7 +96,8 @@ class MessageDecoder:
     def has_header(self) -> bool:
         """Return whether a message is a header or begins with one."""
         fields = self._store.fielddefs[self.type_name][1] if self.is_known else []
-        return self.type_name == HEADER or (bool(fields) and fields[0][1][1] == HEADER)
+        header = "std_msgs/msg/Header"
+        return self.type_name == header or (bool(fields) and fields[0][1][1] == header)
 
 
 class DecoderCache:
@@ -164,19 +159,19 @@ def _parsed_types(definition: MessageDefinition, budget: Budget) -> Types:
     ours = typestore().fielddefs
     if definition.encoding not in ("ros2msg", "ros2idl") or (not text.strip() and name in ours):
         return {}
-    if len(text) > MAX_DEFINITION_CHARS:
-        raise BagError(name, f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
+    if len(text) > 200_000:
+        raise BagError(name, f"a definition of {len(text)} characters; at most 200000 are read")
     try:
         is_msg = definition.encoding == "ros2msg"
         parser = _BoundedMsgParser(f"MSG: {name}\n{text}") if is_msg else _BoundedIdlParser(text)
         parser.budget = budget
-        own = dict(make_typesdict(parser.specification()))
+        types = dict(make_typesdict(parser.specification()))
     except BagError:
         raise BagError(name, "a definition that takes too many steps to parse") from None
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return {}
-    used = {_type_within(kind) for _, fields in own.values() for _, kind in fields} - {""}
-    return own if used <= {*own, *ours} else {}
+    used = {_type_within(kind) for _, fields in types.values() for _, kind in fields} - {""}
+    return types if used <= {*types, *ours} else {}
 
 
 def _fields_within(name: str, types: Types) -> Types:
@@ -211,8 +206,8 @@ def _extent(kind: Any, types: Types, depth: int = 0) -> tuple[int, int, float]:
     if node is Nodetype.BASE:
         size = 4 if detail[0] == "string" else 1
     elif node is Nodetype.NAME:
-        if depth > MAX_NESTING:
-            raise BagError(detail, f"a definition with types more than {MAX_NESTING} deep in each other")
+        if depth > 32:
+            raise BagError(detail, "a definition with types more than 32 deep in each other")
         parts = [_extent(inner, types, depth + 1) for _, inner in types[detail][1]]
         objects, size = 1 + sum(part[0] for part in parts), sum(part[1] for part in parts)
         density = max((part[2] for part in parts), default=0.0)
@@ -226,6 +221,6 @@ def _extent(kind: Any, types: Types, depth: int = 0) -> tuple[int, int, float]:
             raise BagError("", "a definition with a sequence of parts that hold nothing")
         else:
             objects, size, density = 1, 4, density if is_numbers else max(density, objects / size)
-    if not 0 <= objects <= MAX_ELEMENTS:
-        raise BagError("", f"a definition of more than {MAX_ELEMENTS} fields, nested ones counted")
+    if not 0 <= objects <= 4_000:  # for each, whatever the data, a decoder is made
+        raise BagError("", "a definition of more than 4000 fields, nested ones counted")
     return objects, size, density

@@ -6,35 +6,18 @@ import sqlite3
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from difflib import get_close_matches
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import zstandard
 
-from magnetosuture_thread.bags import absolute_topic
+from magnetosuture_thread.bags import absolute_topic, storage
 from magnetosuture_thread.bags.mcap import McapFile
 from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
-from magnetosuture_thread.bags.storage import (
-    CDR,
-    MAX_RECORD_BYTES,
-    NO_CHECKSUM_NOTE,
-    QOS,
-    SALVAGED_NOTE,
-    TYPE_HASH,
-    Budget,
-    Connection,
-    CorruptRegion,
-    DamageReport,
-    MessageDefinition,
-    StoredMessage,
-    find_bag_files,
-    merge_by_time,
-    merge_reports,
-)
+from magnetosuture_thread.bags.storage import CDR, Budget, Connection, CorruptRegion, DamageReport, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
@@ -44,12 +27,6 @@ _TABLES = {
     "messages": {"id", "topic_id", "timestamp", "data"},
     "message_definitions": set[str](),
 }
-# sqlite3 does not enforce column types, so that a row may hold anything.
-_COUNT = """
-    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)),
-    SUM(typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob')
-    FROM messages GROUP BY topic_id
-"""
 
 
 class SqliteFile:
@@ -66,9 +43,9 @@ class SqliteFile:
     """
 
     def __init__(self, path: Path, progress: Callable[[int], None] = lambda count: None) -> None:
-        self.path = path
         if is_url(path):
             raise BagError(path, "is a database, which is read on its own machine only; copy it to this machine")
+        self.path = path
         self.notes: dict[str, str] = {}
         self.has_no_checksum = "has no checksums (sqlite3): damage to it cannot be noticed"
         self.others: Counter[str] = Counter()
@@ -113,41 +90,46 @@ class SqliteFile:
 
     def _check_table(self, database: sqlite3.Connection, table: str) -> None:
         """Refuse a table of rosbag2 that is a view or a virtual table, which has no page, or computes what it holds."""
-        query = "SELECT type, rootpage > 0 FROM sqlite_master WHERE name = ?"
+        query, needed = "SELECT type, rootpage > 0 FROM sqlite_master WHERE name = ?", _TABLES[table]
         rows = database.execute(query, (table,)).fetchall()
-        columns = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
-        if rows != [("table", 1)] and (rows or _TABLES[table]):
+        if rows != [("table", 1)] and (rows or needed):
             raise BagError(self.path, f"has no plain table {table}, which the database of a bag has")
+        columns = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
         plain = {name for name, hidden in columns.items() if not hidden}
-        if problem := ", ".join(sorted((_TABLES[table] - plain) | (columns.keys() - plain))):
+        if problem := ", ".join(sorted((needed - plain) | (columns.keys() - plain))):
             raise BagError(self.path, f"has no column {problem} in its table {table}, or one that is computed")
 
     def _count_messages(self, database: sqlite3.Connection) -> None:
+        """Set counts and times, or refuse a row that has no valid ones: sqlite3 does not enforce column types."""
+        query = """
+            SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM(timestamp >= 0
+            AND typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob')
+            FROM messages GROUP BY topic_id
+        """
         times: list[int] = []
-        for topic, count, first, last, longest, valid in database.execute(_COUNT):
+        for topic, count, first, last, longest, valid in database.execute(query):
             if topic not in self.connections or valid < count:
                 raise sqlite3.DatabaseError(f"{count} rows of which some have no valid time, topic or data")
-            if longest > MAX_RECORD_BYTES:
-                raise BagError(self.path, f"has a message of {longest} bytes; at most {MAX_RECORD_BYTES} are read")
+            if longest > storage.MAX_RECORD_BYTES:
+                problem = f"has a message of {longest} bytes; at most {storage.MAX_RECORD_BYTES} are read"
+                raise BagError(self.path, problem)
             self.counts[topic] = count
             times += first, last
         self.start, self.end = min(times, default=0), max(times, default=0)
 
-    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[storage.StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
 
         Raises:
             BagError: the file has changed since it was verified, or cannot be read any more.
         """
         wanted = sorted(set(connections) & set(self.counts))
-        query = f"""
-            SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({",".join("?" * len(wanted))})
-            AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id
-        """
+        where = f"topic_id IN ({','.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
+        query = f"SELECT timestamp, topic_id, data FROM messages WHERE {where} ORDER BY timestamp, id"
         try:
             with closing(self._connect()) as database:
                 for time, topic, data in database.execute(query, (*wanted, max(start, self.start), min(end, self.end))):
-                    yield StoredMessage(time, self.connections[topic], data)
+                    yield storage.StoredMessage(time, self.connections[topic], data)
         except (sqlite3.Error, OverflowError) as error:
             raise BagError(self.path, f"cannot be read any more: {_one_line(error)}") from None
 
@@ -161,26 +143,23 @@ def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
     database.row_factory = sqlite3.Row
     columns = {row["name"] for row in database.execute("PRAGMA table_info(message_definitions)")}
     rows = database.execute("SELECT * FROM message_definitions") if "encoded_message_definition" in columns else ()
-    definitions = {
-        row["topic_type"]: MessageDefinition(row["topic_type"], row["encoding"], row["encoded_message_definition"])
-        for row in rows
-    }
+    parts = "topic_type", "encoding", "encoded_message_definition"
+    definitions = {row["topic_type"]: MessageDefinition(*(row[part] for part in parts)) for row in rows}
     connections = {}
-    for row in database.execute("SELECT * FROM topics"):
-        entries = dict(row)
+    for row in map(dict[str, Any], database.execute("SELECT * FROM topics")):
         definition = definitions.get(row["type"]) or MessageDefinition(row["type"])
-        metadata = {QOS: entries.get("offered_qos_profiles"), TYPE_HASH: entries.get("type_description_hash")}
+        metadata = {storage.QOS: row.get("offered_qos_profiles"), storage.TYPE_HASH: row.get("type_description_hash")}
         texts = {key: text for key, text in metadata.items() if isinstance(text, str)}
-        named = (row["name"], definition.type_name, definition.encoding, definition.text, row["serialization_format"])
+        connection = Connection(row["name"], definition, row["serialization_format"], texts)
+        named = (connection.topic, connection.serialization, *astuple(definition))
         if isinstance(row["id"], int) and all(isinstance(text, str) for text in named):
-            connections[row["id"]] = Connection(row["name"], definition, row["serialization_format"], texts)
+            connections[row["id"]] = connection
     database.row_factory = None
     return connections
 
 
 Progress = Callable[[float], None]
-BagStorage = McapFile | SqliteFile
-_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
+BagFile = McapFile | SqliteFile
 _OWN_DECODERS = DecoderCache(Budget("messages", 0))  # of messages of no bag
 
 
@@ -257,35 +236,35 @@ class Bag:
         self, path: Path, *, remap: Mapping[str, str] | None = None, progress: Progress = lambda fraction: None
     ) -> None:
         self.path = path
-        found = find_bag_files(path)
-        budget = Budget(path, sum(_file_size(file) for file in found.files))
+        files = storage.find_bag_files(path)
+        budget = Budget(path, sum(_file_size(file) for file in files.files))
         self.decoders = DecoderCache(budget)
-        self._storages, problems = _open(found.files, budget, progress)
-        lost = [DamageReport((region,), 0, region.end, None) for region in (*found.lost, *problems)]
-        self.damage = merge_reports([*(storage.damage for storage in self._storages), *lost])
-        self.remarks, self.custom_data = found.remarks, found.custom_data
-        self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
-        self.others = sum((storage.others for storage in self._storages), Counter[str]())
-        self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
-        self.salvaged_without_checksum = self.notes.get(SALVAGED_NOTE, "")
-        doubt = next((storage.has_no_checksum for storage in self._storages if storage.has_no_checksum), "")
-        self.has_no_checksum = doubt or self.notes.get(NO_CHECKSUM_NOTE, "")
-        if not any(storage.counts for storage in self._storages):
-            raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
-        filled = [storage for storage in self._storages if storage.counts]
-        self.start = min(storage.start for storage in filled)
-        self.end = max(storage.end for storage in filled)
+        self._files, problems = _open(files.files, budget, progress)
+        lost = [DamageReport((region,), 0, region.end, None) for region in (*files.lost, *problems)]
+        self.damage = storage.merge_reports([*(file.damage for file in self._files), *lost])
+        self.remarks, self.custom_data = files.remarks, files.custom_data
+        self.facts = [{"file": file.path.name, **file.facts} for file in self._files]
+        self.others = sum((file.others for file in self._files), Counter[str]())
+        self.notes = next((file.notes for file in self._files if file.notes), files.notes)
+        self.salvaged_without_checksum = self.notes.get(storage.SALVAGED_NOTE, "")
+        doubt = next((file.has_no_checksum for file in self._files if file.has_no_checksum), "")
+        self.has_no_checksum = doubt or self.notes.get(storage.NO_CHECKSUM_NOTE, "")
+        filled = [file for file in self._files if file.counts]
+        if not filled:
+            raise BagError(files.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
+        self.start = min(file.start for file in filled)
+        self.end = max(file.end for file in filled)
         self.duration = (self.end - self.start) * 1e-9
         self._names = apply_remap(path, {connection.topic for connection in self.connections()}, remap or {})
         self.counts: Counter[str] = Counter()
         types: dict[str, dict[str, None]] = {}
-        for storage in self._storages:
-            for number, connection in storage.connections.items():
-                name, count = self._names[connection.topic], storage.counts.get(number, 0)
-                self.counts[name] += count
+        for file in self._files:
+            for number, connection in file.connections.items():
+                name = self._names[connection.topic]
+                self.counts[name] += file.counts.get(number, 0)
                 types.setdefault(name, {})[connection.type_name] = None
-        self.topics = {name: next(iter(own)) for name, own in types.items() if len(own) == 1}
-        self.conflicts = {name: tuple(own) for name, own in types.items() if len(own) > 1}
+        self.topics = {name: next(iter(kinds)) for name, kinds in types.items() if len(kinds) == 1}
+        self.conflicts = {name: tuple(kinds) for name, kinds in types.items() if len(kinds) > 1}
 
     def records(
         self,
@@ -308,50 +287,47 @@ class Bag:
         """
         for topic in topics or ():
             if topic in self.conflicts:
-                types = " and ".join(self.conflicts[topic])
-                raise BagError(self.path, f"topic {topic} has two types, {types}; expected one")
+                raise BagError(self.path, self.conflict(topic))
         wanted = set(self.topics if topics is None else topics)
-        loaded = (self._load(item, refused, only=CDR) for item in self._stored(wanted, start, duration))
+        loaded = (self._load(item, refused, cdr_only=True) for item in self._stored(wanted, start, duration))
         return (record for record in loaded if record is not None)
 
-    def stored(self) -> Iterator[StoredMessage]:
+    def conflict(self, topic: str) -> str:
+        """Return in words that a topic has two types."""
+        return f"topic {topic} has two types, {' and '.join(self.conflicts[topic])}; expected one"
+
+    def stored(self) -> Iterator[storage.StoredMessage]:
         """Yield all messages by time as they are stored, whatever their type or serialization."""
         return self._stored(set(self.counts), 0.0, None)
 
-    def load(self, item: StoredMessage) -> bytes:
+    def load(self, item: storage.StoredMessage) -> bytes:
         """Return a stored message as it was before the recorder packed it, if it did.
 
         Raises:
             BagError: it cannot be unpacked.
         """
-        if item.connection.serialization != CDR or not item.data.startswith(_ZSTD):
+        # No CDR message begins as one of zstd does: its first byte is 0.
+        if item.connection.serialization != CDR or not item.data.startswith(b"\x28\xb5\x2f\xfd"):
             return item.data
-        topic = self._names[item.connection.topic]
         try:
-            if zstandard.frame_content_size(item.data) > MAX_RECORD_BYTES:
-                raise BagError(topic, f"a packed message is larger than {MAX_RECORD_BYTES} bytes")
-            # Without a size in it, a frame is unpacked to this many bytes at most.
-            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES)
-            return unpacker.decompress(item.data, max_output_size=MAX_RECORD_BYTES)
+            return storage.unpack_zstd(item.data)
         except (zstandard.ZstdError, MemoryError) as error:
+            topic = self._names[item.connection.topic]
             raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None
 
     def every_record(self, refused: Counter[str]) -> Iterator[tuple[Connection, RecordedMessage]]:
-        """Yield all messages by time, each with its connection.
-
-        Messages of topics with two types, and messages that are not CDR, are included.
+        """Yield all messages by time with their connections, also of topics with two types, and that are not CDR.
 
         Args:
             refused: counts the messages that cannot be decompressed, by reason.
         """
         for item in self.stored():
-            record = self._load(item, refused)
-            if record is not None:
+            if record := self._load(item, refused):
                 yield item.connection, record
 
     def connections(self) -> list[Connection]:
         """Return the connections of all files, under their recorded names."""
-        return [connection for storage in self._storages for connection in storage.connections.values()]
+        return [connection for file in self._files for connection in file.connections.values()]
 
     def name_of(self, connection: Connection) -> str:
         """Return the remapped topic of a connection."""
@@ -361,59 +337,60 @@ class Bag:
         """Return the name that a topic was recorded under."""
         return next(recorded for recorded, name in self._names.items() if name == topic)
 
-    def _load(self, item: StoredMessage, refused: Counter[str] | None, only: str = "") -> RecordedMessage | None:
+    def _load(
+        self, item: storage.StoredMessage, refused: Counter[str] | None, cdr_only: bool = False
+    ) -> RecordedMessage | None:
         """Return a message; None, and count it, if it cannot be decompressed or has another serialization."""
-        connection = item.connection
-        topic = self._names[connection.topic]
+        kind, topic = item.connection, self._names[item.connection.topic]
         try:
-            if only and connection.serialization != only:
-                raise BagError(topic, f"its messages are written as {connection.serialization!r}, expected {only!r}")
+            if cdr_only and kind.serialization != CDR:
+                raise BagError(topic, f"its messages are written as {kind.serialization!r}, expected {CDR!r}")
             data = self.load(item)
         except BagError as error:
             if refused is None:
                 raise
             refused[str(error)] += 1
             return None
-        return RecordedMessage(topic, connection.type_name, item.time, data, connection.definition, self.decoders)
+        return RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self.decoders)
 
-    def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[StoredMessage]:
+    def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[storage.StoredMessage]:
         first = self.start + round(start * 1e9)
         last = self.end if duration is None else first + round(duration * 1e9)
         parts = []
-        for storage in sorted(self._storages, key=lambda storage: storage.start):
-            wanted = [number for number, c in storage.connections.items() if self._names[c.topic] in topics]
-            if wanted:
-                parts.append((storage.start, partial(storage.messages, wanted, first, last)))
-        return merge_by_time(parts)
+        for file in sorted(self._files, key=lambda file: file.start):
+            numbers = [number for number, c in file.connections.items() if self._names[c.topic] in topics]
+            if numbers:
+                parts.append((file.start, file.messages(numbers, first, last)))
+        return storage.merge_by_time(parts)
 
 
-def _open(files: list[Path], budget: Budget, progress: Progress) -> tuple[list[BagStorage], list[CorruptRegion]]:
+def _open(files: list[Path], budget: Budget, progress: Progress) -> tuple[list[BagFile], list[CorruptRegion]]:
     """Open the files of a bag; of several, unreadable ones are returned as corrupt regions.
 
     Raises:
         BagError: none can be read, or one cannot be fetched: a network that fails is no damage.
     """
-    storages: list[BagStorage] = []
+    opened: list[BagFile] = []
     problems: list[CorruptRegion] = []
     cause: BaseException | None = None
-    total, done = sum(_file_size(file) for file in files), 0
+    total, done = sum(map(_file_size, files)), 0
 
-    def report(count: int) -> None:
+    def advance(count: int) -> None:
         nonlocal done
         done += count
         progress(min(1.0, done / max(total, 1)))
 
     for file in files:
         try:
-            storages.append(SqliteFile(file, report) if file.suffix == ".db3" else McapFile(file, budget, report))
+            opened.append(SqliteFile(file, advance) if file.suffix == ".db3" else McapFile(file, budget, advance))
         except BagError as error:
             if len(files) == 1 or (is_url(file) and isinstance(error.__cause__, OSError)):
                 raise
             problems.append(CorruptRegion(file.name, 0, _file_size(file), error.problem))
             cause = cause or error.__cause__
-    if not storages:
+    if not opened:
         raise BagError(files[0].parent, f"holds no file that can be read; {problems[0]}") from cause
-    return storages, problems
+    return opened, problems
 
 
 def _file_size(file: Path) -> int:

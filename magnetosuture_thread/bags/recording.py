@@ -1,23 +1,26 @@
-"""Adapts a bag to our graph: converts its topics, types and frames to ours."""
+"""Adapts a bag to our graph: converts its topics, types and frames to ours; and reports what a bag holds."""
 
 from __future__ import annotations
 
 import math
 import struct
+from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.cdr import is_in_dish_frame, pack, stamp_and_frame
-from magnetosuture_thread.bags.markers import ADD, LINE_STRIP
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import MarkerType, pack
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.reading import is_in_dish_frame, nanoseconds, stamp_and_frame
+from magnetosuture_thread.bags.storage import CDR, MAX_SILENCE
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, DISH_FRAME, Channel, is_rectified
@@ -25,17 +28,9 @@ from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, DISH_FR
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-CHANNELS = tuple(value for value in vars(interface).values() if isinstance(value, Channel))
-_CAMERA_TOPICS = {channel.recorded for channel in CAMERA.values()}
-_CAMERA_TYPES = {channel.type_name for channel in CAMERA.values()}
-
-STATIC_TRANSFORMS = "/tf_static"
-TRANSFORMS = ("/tf", STATIC_TRANSFORMS)
-POSE = "geometry_msgs/msg/PoseStamped"
-POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+TWIST, UNSTAMPED_TWIST = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"
 PATH = "nav_msgs/msg/Path"
-TWIST = "geometry_msgs/msg/TwistStamped"
-UNSTAMPED_TWIST = "geometry_msgs/msg/Twist"
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion without rotation
 
 Matrix = NDArray[np.float64]  # homogeneous, shape (4, 4): p' = R p + t
@@ -80,10 +75,9 @@ class Recording:
         self._dish_frame = dish_frame.lstrip("/")
         self._transforms: TransformTree | None = None
         self._topics: dict[Channel, str] = {}
-        for channel in CHANNELS:
-            self._match(channel)
-        for channel, topic in self._topics.items():
-            self.counts[channel.recorded] = bag.counts[topic]
+        for channel in (value for value in vars(interface).values() if isinstance(value, Channel)):
+            if topic := self._matching_topic(channel):
+                self._topics[channel], self.counts[channel.recorded] = topic, bag.counts[topic]
         cameras = [channel for channel in CAMERA.values() if self.counts.get(channel.recorded)]
         self.camera: Channel | None = max(cameras, key=lambda c: self.counts[c.recorded], default=None)
         topic = bag.recorded_name(self._topics[self.camera]) if self.camera is not None else ""
@@ -92,15 +86,19 @@ class Recording:
             del self.counts[CAMERA_INFO.recorded]
             self.remarks.append(f"{topic} is rectified: the lens of {CAMERA_INFO.recorded} is not undone again")
 
+    def refuse_unfit(self, *channels: Channel) -> None:
+        """Raise `BagError` if a topic with the name of one of some channels cannot be used."""
+        for channel in channels:
+            if channel.recorded in self.unfit:
+                raise BagError(self.path, self.unfit[channel.recorded])
+
     def require(self, channel: Channel) -> None:
         """Raise `BagError` unless the bag has messages for a channel."""
-        if channel.recorded in self.unfit:
-            raise BagError(self.path, self.unfit[channel.recorded])
+        self.refuse_unfit(channel)
         if not self.counts.get(channel.recorded):
-            present = ", ".join(sorted(self._bag.counts)) or "none"
-            needed = f"has no messages on {channel.recorded} ({channel.type_name})"
-            remap = f"; its topics: {present}; remap one by TOPIC:={channel.recorded}"
-            raise BagError(self.path, needed + remap)
+            topics = ", ".join(sorted(self._bag.counts)) or "none"
+            remap = f"its topics: {topics}; remap one by TOPIC:={channel.recorded}"
+            raise BagError(self.path, f"has no messages on {channel.recorded} ({channel.type_name}); {remap}")
 
     def records(
         self, channels: Collection[Channel], *, start: float = 0.0, duration: float | None = None
@@ -116,9 +114,7 @@ class Recording:
             BagError: a topic has a type that cannot be converted, or a frame without a transform to the dish frame; or
                 the bag has changed since it was opened.
         """
-        for channel in channels:
-            if channel.recorded in self.unfit:
-                raise BagError(self.path, self.unfit[channel.recorded])
+        self.refuse_unfit(*channels)
         wanted = {self._topics[channel]: channel for channel in channels if channel in self._topics}
         # The first message of each, so that an unknown frame is reported before any message is used.
         for topic, channel in wanted.items():
@@ -140,25 +136,24 @@ class Recording:
             except UnfitError as problem:
                 self.refused[f"{channel.recorded}: {problem}"] += 1
 
-    def _match(self, channel: Channel) -> None:
-        """Find the topic for one of our channels."""
+    def _matching_topic(self, channel: Channel) -> str:
+        """Return the topic for one of our channels; empty, and `unfit` says why, where there is none."""
         bag, name = self._bag, channel.recorded
-        if name in _CAMERA_TOPICS:
-            fitting = [topic for topic in _CAMERA_TOPICS if bag.topics.get(topic) == channel.type_name]
-            if fitting:
-                self._topics[channel] = name if name in fitting else fitting[0]
-                return
-            if bag.topics.get(name) in _CAMERA_TYPES:
-                return  # used by the other camera channel
+        if channel in CAMERA.values():
+            topics = [name, *(other.recorded for other in CAMERA.values())]
+            if fitting := [topic for topic in topics if bag.topics.get(topic) == channel.type_name]:
+                return fitting[0]
+            if bag.topics.get(name) in {other.type_name for other in CAMERA.values()}:
+                return ""  # used by the other camera channel
+        accepted = {*CONVERTED.get(channel.type_name, ()), channel.type_name}
         if name in bag.conflicts:
-            self.unfit[name] = f"topic {name} has two types, {' and '.join(bag.conflicts[name])}; expected one"
+            self.unfit[name] = bag.conflict(name)
+        elif bag.topics.get(name) in accepted:
+            return name
         elif name in bag.topics:
-            accepted = {*CONVERTED.get(channel.type_name, ()), channel.type_name}
-            if bag.topics[name] in accepted:
-                self._topics[channel] = name
-            else:
-                expected = " or ".join(sorted(accepted))
-                self.unfit[name] = f"topic {name} is of type {bag.topics[name]}, expected {expected}"
+            expected = " or ".join(sorted(accepted))
+            self.unfit[name] = f"topic {name} is of type {bag.topics[name]}, expected {expected}"
+        return ""
 
     def convert(self, record: RecordedMessage, channel: Channel) -> RecordedMessage:
         """Return a message converted to our type and frame.
@@ -213,11 +208,8 @@ class Recording:
         if not frame or self._transforms.lookup(frame, self._dish_frame, None) is None:
             known = ", ".join(self._transforms.frames) or "none"
             which = f"the frame {frame}, which is not connected to {self._dish_frame}" if frame else "an empty frame"
-            raise BagError(
-                self.path,
-                f"topic {topic} has {which}; frames on {' and '.join(TRANSFORMS)}: {known}. "
-                f"If it is the dish frame, give it: --frame {frame or repr(frame)}",
-            )
+            advice = f"If it is the dish frame, give it: --frame {frame or repr(frame)}"
+            raise BagError(self.path, f"topic {topic} has {which}; frames on /tf and /tf_static: {known}. {advice}")
         matrix = self._transforms.lookup(frame, self._dish_frame, stamp)
         if matrix is None:
             raise UnfitError(f"no transform from its frame {frame} at its time")
@@ -225,7 +217,7 @@ class Recording:
 
     def _transform_messages(self) -> Iterator[tuple[str, Any]]:
         """Yield topic and message of all transforms; invalid ones are counted in `refused`."""
-        topics = [topic for topic in TRANSFORMS if self._bag.topics.get(topic) == "tf2_msgs/msg/TFMessage"]
+        topics = [topic for topic in ("/tf", "/tf_static") if self._bag.topics.get(topic) == "tf2_msgs/msg/TFMessage"]
         for record in self._bag.records(topics, refused=self.refused):
             try:
                 if not record.decoder.is_ours:
@@ -252,16 +244,15 @@ class TransformTree:
         self._edges: dict[str, list[tuple[float, str, Matrix]]] = {}
         static: dict[str, list[tuple[float, str, Matrix]]] = {}
         for topic, message in messages:
-            for each in message.transforms:
-                child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
-                matrix = matrix_of(each.transform.translation, each.transform.rotation)
+            for transform in message.transforms:
+                child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
+                matrix = matrix_of(transform.transform)
                 if matrix is None or child == parent:
                     continue
-                if topic == STATIC_TRANSFORMS:
+                if topic == "/tf_static":
                     static[child] = [(-math.inf, parent, matrix)]
                 else:
-                    stamp = each.header.stamp.sec * 10**9 + each.header.stamp.nanosec
-                    self._edges.setdefault(child, []).append((stamp, parent, matrix))
+                    self._edges.setdefault(child, []).append((nanoseconds(transform.header.stamp), parent, matrix))
         self._edges |= static
         for entries in self._edges.values():
             entries.sort(key=itemgetter(0))
@@ -282,22 +273,22 @@ class TransformTree:
     def _ancestors(self, frame: str, stamp: int | None) -> dict[str, Matrix]:
         """Return the transform of a frame into each of its ancestors, from the nearest on."""
         matrix = np.eye(4)
-        found = {frame: matrix}
+        ancestors = {frame: matrix}
         while entries := self._edges.get(frame):
             index = len(entries) if stamp is None else bisect_right(entries, stamp, key=itemgetter(0))
             if not index:
                 break  # Nothing is known as early as that.
             _, frame, up = entries[index - 1]
-            if frame in found:
+            if frame in ancestors:
                 break  # A cycle of frames.
             matrix = up @ matrix
-            found[frame] = matrix
-        return found
+            ancestors[frame] = matrix
+        return ancestors
 
 
-def matrix_of(place: Any, turn: Any) -> Matrix | None:
-    """Return the transform of a point or vector and a quaternion; None if it is not finite, or the quaternion 0."""
-    matrix = np.eye(4)
+def matrix_of(transform: Any) -> Matrix | None:
+    """Return a Transform as a matrix; None if it is not finite, or its quaternion 0."""
+    place, turn, matrix = transform.translation, transform.rotation, np.eye(4)
     matrix[:3, 3] = place.x, place.y, place.z
     try:
         matrix[:3, :3] = _rotations(np.array([[turn.x, turn.y, turn.z, turn.w]])).as_matrix()[0]
@@ -316,7 +307,7 @@ def _rotations(quaternions: NDArray[np.float64]) -> Rotation:
 
     greatest = np.abs(quaternions).max(axis=1, keepdims=True)
     if not np.isfinite(greatest).all() or not greatest.all():
-        raise UnfitError("an orientation that is none")
+        raise UnfitError("not a valid orientation")
     return Rotation.from_quat(quaternions / greatest)  # whose length neither vanishes nor overflows
 
 
@@ -326,46 +317,39 @@ def _pose(position: Any, orientation: Any = None) -> list[float]:
     return [position.x, position.y, position.z, *turn]
 
 
-def _needle_pose(message: Any) -> list[list[float]]:
+def _needle_pose(message: Any) -> list[float]:
     """Return the pose in a message that holds one, however deep."""
     if hasattr(message, "transform"):
-        if matrix_of(message.transform.translation, message.transform.rotation) is None:
-            raise UnfitError("a transform that is none")
-        return [_pose(message.transform.translation, message.transform.rotation)]
+        if matrix_of(message.transform) is None:
+            raise UnfitError("not a valid transform")
+        return _pose(message.transform.translation, message.transform.rotation)
     pose = getattr(message.pose, "pose", message.pose)
-    return [_pose(pose.position, pose.orientation)]
+    return _pose(pose.position, pose.orientation)
 
 
 def _marker_poses(message: Any) -> list[list[float]]:
     """Return the points of a Marker that is a line strip, as poses."""
-    if message.action != ADD or message.type != LINE_STRIP:
+    if message.action != 0 or message.type != MarkerType.LINE_STRIP:
         raise UnfitError("a marker that is no line strip being added")
-    own = np.array(_pose(message.pose.position, message.pose.orientation))
-    place, turn = own[:3], own[3:] if own[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation
+    pose = np.array(_pose(message.pose.position, message.pose.orientation))
+    place, turn = pose[:3], pose[3:] if pose[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation
     if not np.isfinite(place).all():
         raise UnfitError("a place that is not finite")
     points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)
     return [[*point, *UPRIGHT] for point in _rotations(turn[None]).apply(points) + place]
 
 
-# By the type that a bag may have: what gives the poses in a message.
-_POSES: dict[str, Callable[[Any], list[list[float]]]] = dict.fromkeys(
-    (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"), _needle_pose
-)
+# By the type that a bag may have: what gives the points or poses of a thread in a message.
 _PATHS: dict[str, Callable[[Any], list[list[float]]]] = {
-    PATH: lambda m: [_pose(each.pose.position, each.pose.orientation) for each in m.poses],
-    "geometry_msgs/msg/PoseArray": lambda m: [_pose(each.position, each.orientation) for each in m.poses],
+    PATH: lambda m: [_pose(stamped.pose.position, stamped.pose.orientation) for stamped in m.poses],
+    "geometry_msgs/msg/PoseArray": lambda m: [_pose(pose.position, pose.orientation) for pose in m.poses],
     "geometry_msgs/msg/PolygonStamped": lambda m: [_pose(point) for point in m.polygon.points],
     "visualization_msgs/msg/Marker": _marker_poses,
     "magnetosuture_msgs/msg/PredictedThread": lambda m: [_pose(point) for point in m.positions],
 }
-CONVERTED = {
-    POSE: tuple(_POSES),
-    POSE_WITH_COVARIANCE: tuple(_POSES),
-    PATH: tuple(_PATHS),
-    TWIST: (TWIST, UNSTAMPED_TWIST),
-}
-"""Types that a bag may have, by the type that our graph takes."""
+_POSES = (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry")
+# Types that a bag may have, by the type that our graph takes.
+CONVERTED = {POSE: _POSES, POSE_WITH_COVARIANCE: _POSES, PATH: tuple(_PATHS), TWIST: (TWIST, UNSTAMPED_TWIST)}
 
 
 def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -> bytes:
@@ -386,16 +370,15 @@ def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -
     """
     if type_name == TWIST:
         twist = getattr(message, "twist", message)
-        vectors = np.array([[each.x, each.y, each.z] for each in (twist.linear, twist.angular)])
+        vectors = np.array([[vector.x, vector.y, vector.z] for vector in (twist.linear, twist.angular)])
         if matrix is not None:  # else inf would make nan of its neighbours
             vectors = vectors @ matrix[:3, :3].T
         return pack("header float64[6]", stamp, vectors)
-    kind = message.__msgtype__
     if type_name == PATH:
-        poses = _moved(_PATHS[kind](message), matrix)
+        poses = _moved(_PATHS[message.__msgtype__](message), matrix)
         fields = [field for pose in poses for field in (stamp, pose)]
         return pack("header uint32" + " header float64[7]" * len(poses), stamp, len(poses), *fields)
-    (pose,) = _moved(_POSES[kind](message), matrix)
+    (pose,) = _moved([_needle_pose(message)], matrix)
     if type_name == POSE:
         return pack("header float64[7]", stamp, pose)
     covariance = np.reshape(getattr(getattr(message, "pose", None), "covariance", np.zeros(36)), (6, 6))
@@ -414,3 +397,111 @@ def _moved(poses: list[list[float]], matrix: Matrix | None) -> Matrix:
         turned = type(turns).from_matrix(matrix[:3, :3]) * turns
         moved[:, 3:] = turned.as_quat() * np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
     return moved
+
+
+@dataclass
+class TopicReport:
+    """Report on a topic.
+
+    Attributes:
+        topic: its name, remapped.
+        types: of its messages; more than one is an error of the recorder.
+        channel: of our graph that the topic is used as; None for a topic that it does not use.
+        known: whether at least one of its messages can be used.
+        problem: why none can, although the topic has the name of one of ours.
+        times: when each message was recorded [s since the bag's start].
+        stamps: of the messages that have one [ns].
+        unreadable: number of messages whose stamp cannot be read although their type has one.
+        frames: frame ids of the messages.
+    """
+
+    topic: str
+    types: tuple[str, ...]
+    channel: Channel | None
+    known: bool
+    problem: str
+    times: array[float] = field(default_factory=lambda: array("d"))
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    unreadable: int = 0
+    frames: set[str] = field(default_factory=set)
+
+    def add(self, record: RecordedMessage, time: float, serialization: str, recording: Recording) -> None:
+        """Add a message that was recorded at a time [s since the bag's start]; try to use it until one can be used."""
+        self.times.append(time)
+        if serialization == CDR and record.decoder.has_header():
+            try:
+                stamp, frame = stamp_and_frame(record.topic, record.data)
+                self.stamps.append(stamp)
+                self.frames.add(frame)
+            except BagError:
+                self.unreadable += 1
+        if self.channel is None or self.known:
+            return
+        try:
+            if serialization != CDR:
+                raise UnfitError(f"they are written as {serialization!r}, expected {CDR!r}")
+            recording.convert(record, self.channel).decode()
+            self.known, self.problem = True, ""
+        except (UnfitError, BagError) as error:
+            reason = error.problem if isinstance(error, BagError) else error
+            self.problem = self.problem or f"none of the messages on {self.topic} can be used: {reason}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report in SI units; null where there is no value."""
+        times = np.array(self.times)
+        span = float(np.ptp(times)) if len(times) else 0.0
+        return {
+            "topic": self.topic,
+            "types": list(self.types),
+            "messages": len(times),
+            "rate_hz": (len(times) - 1) / span if span > 0.0 else None,
+            "first_s": float(times[0]) if len(times) else None,
+            "last_s": float(times[-1]) if len(times) else None,
+            "greatest_gap_s": float(np.diff(times).max()) if len(times) > 1 else None,
+            "stamps_going_back": int((np.diff(np.array(self.stamps)) < 0).sum()),
+            "unreadable_stamps": self.unreadable,
+            "frames": sorted(self.frames),
+            "known": self.known,
+            "problem": self.problem or None,
+        }
+
+
+def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """Read all messages of a bag and return a report on its content in SI units; null where there is no value.
+
+    Args:
+        bag: to inspect.
+        dish_frame: name of the dish frame in the bag.
+        progress: called with the share done, 0 to 1.
+    """
+    recording = Recording(bag, dish_frame=dish_frame)
+    topics: dict[str, TopicReport] = {}
+    for name in sorted(bag.counts):
+        channel = recording.channel_of(name)
+        is_empty = channel is not None and not bag.counts[name]
+        types = bag.conflicts.get(name) or (bag.topics[name],)
+        topics[name] = TopicReport(name, types, channel, is_empty, recording.unfit.get(name, ""))
+    refused: Counter[str] = Counter()
+    silences, last = list[dict[str, float]](), 0.0
+    for connection, record in bag.every_record(refused):
+        time = (record.time - bag.start) * 1e-9
+        if time - last > MAX_SILENCE:
+            silences.append({"begin_s": last, "end_s": time})
+        last = time
+        topics[record.topic].add(record, time, connection.serialization, recording)
+        progress(time / max(bag.duration, 1e-9))
+    return {
+        "bag": str(bag.path),
+        "start_s": bag.start * 1e-9,
+        "duration_s": bag.duration,
+        "messages": sum(bag.counts.values()),
+        "notes": bag.notes,
+        "files": bag.facts,
+        "has_no_checksum": bag.has_no_checksum or None,
+        "salvaged_without_checksum": bag.salvaged_without_checksum or None,
+        "remarks": bag.remarks,
+        "refused": dict(refused),
+        "silences": silences,
+        "damage": None if bag.damage is None else bag.damage.to_json(),
+        "topics": [topic.to_json() for topic in topics.values()],
+    }

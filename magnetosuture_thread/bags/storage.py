@@ -1,19 +1,20 @@
-"""What the formats of bags share: files and metadata, connections, messages by time, damage, and caps on sizes."""
+"""Common parts of the formats of bags: files and metadata, connections, messages by time, damage, caps on sizes."""
 
 from __future__ import annotations
 
-import heapq
 import json
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from heapq import heappop, heappush, heapreplace
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, cast
 
 import yaml
+import zstandard
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from magnetosuture_thread.settings.errors import BagError
@@ -29,9 +30,7 @@ SALVAGED_NOTE = "unverified"  # note of a bag that an earlier version salvaged w
 NO_CHECKSUM_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 MAX_SILENCE = 5.0  # s without any message, which a person waits for; longer is a pause, or a clock that was set
 MAX_RECORD_BYTES = 1 << 26  # of a message or a chunk of messages, packed or not
-MAX_QOS_CHARS = 20_000  # of the quality of service of a topic, where a publisher takes 400
 RANGE_BYTES = 1 << 20  # fetched at once, at least, of a file that a URL names
-_CHECKSUM = "crc32"  # note: of all others
 
 
 class Budget:
@@ -118,6 +117,23 @@ class DamageReport:
         verb = "is" if self.messages in (1, None) else "are"
         return f"is damaged ({where}): {lost}{chunks} {verb} lost, all else is read"
 
+    def to_json(self) -> dict[str, Any]:
+        """Return the report in SI units; null where there is no value."""
+        places = [
+            {
+                "file": region.file,
+                "start_byte": region.start,
+                "end_byte": region.end,
+                "what": region.what,
+                "text": str(region),
+                "first_s": None if region.first is None else region.first * 1e-9,
+                "last_s": None if region.last is None else region.last * 1e-9,
+            }
+            for region in self.regions
+        ]
+        lost = {"chunks_lost": self.chunks, "bytes_lost": self.bytes, "messages_lost": self.messages}
+        return {"text": str(self), **lost, "places": places}
+
 
 def silence_text(begin: float, end: float) -> str:
     """Return a line on a silence of more than `MAX_SILENCE`, with where it begins and ends in the bag [s]."""
@@ -198,27 +214,31 @@ class StoredMessage(NamedTuple):
     sequence: int | None = None
 
 
-def merge_by_time(parts: Iterable[tuple[int, Callable[[], Iterator[StoredMessage]]]]) -> Iterator[StoredMessage]:
+def merge_by_time(parts: Iterable[tuple[int, Iterator[StoredMessage]]]) -> Iterator[StoredMessage]:
     """Yield the messages of all parts by time; of parts that do not overlap, one is in memory at a time.
 
     Args:
-        parts: start time of each part, and a function that yields its messages by time. Sorted by start time.
+        parts: a time that no message of the part is before, by which they are sorted, and its messages by time.
     """
-    heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
-    last: tuple[float, Callable[[], Iterator[StoredMessage]]] = (math.inf, lambda: iter(()))
-    for part, (start, read) in enumerate(chain(parts, [last])):
+    heap: list[tuple[float, int, StoredMessage | None, Iterator[StoredMessage]]] = []
+    end: tuple[float, Iterator[StoredMessage]] = (math.inf, iter(()))
+    for number, (start, messages) in enumerate(chain(parts, [end])):
         while heap and heap[0][0] < start:  # what comes before anything of this part
-            _, number, item, items = heap[0]
-            yield item
-            following = next(items, None)
-            if following is None:
-                heapq.heappop(heap)
+            _, part, message, following = heap[0]
+            if message is not None:
+                yield message
+            if (message := next(following, None)) is None:
+                heappop(heap)
             else:
-                heapq.heapreplace(heap, (following.time, number, following, items))
-        items = read()
-        first = next(items, None)
-        if first is not None:
-            heapq.heappush(heap, (first.time, part, first, items))
+                heapreplace(heap, (message.time, part, message, following))
+        heappush(heap, (start, number, None, messages))
+
+
+def unpack_zstd(data: bytes, size: int = MAX_RECORD_BYTES) -> bytes:
+    """Return data unpacked, to a size at most where the frame does not say its own; any other size is a `ZstdError`."""
+    if zstandard.frame_content_size(data) > size:
+        raise zstandard.ZstdError(f"it is larger than {size} bytes")
+    return zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).decompress(data, max_output_size=size)
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -239,7 +259,7 @@ class BagFiles:
         custom_data: entries of others.
     """
 
-    files: list[Path] = field(default_factory=list)
+    files: list[Path]
     lost: list[CorruptRegion] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     notes: dict[str, str] = field(default_factory=dict)
@@ -258,24 +278,23 @@ def find_bag_files(path: Path) -> BagFiles:
     try:
         path.stat()
         is_file = path.is_file()
-        inside = [path] if is_file else sorted((file for file in path.iterdir() if file.is_file()), key=_by_number)
+        entries = [path] if is_file else sorted((file for file in path.iterdir() if file.is_file()), key=_by_number)
     except FileNotFoundError as error:
         raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from error
     except Exception as error:  # The file system of a URL raises whatever its library does.
-        problem = getattr(error, "strerror", None) or error
-        raise BagError(path, f"cannot be read: {problem}") from error
-    files = {file.name: file for file in inside if file.suffix in STORAGE_SUFFIXES}
-    packed = [file.name for file in inside if file.name.endswith(COMPRESSED_SUFFIXES) and file.stem not in files]
+        raise BagError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    files = {file.name: file for file in entries if file.suffix in STORAGE_SUFFIXES}
+    packed = [file.name for file in entries if file.name.endswith(COMPRESSED_SUFFIXES) and file.stem not in files]
     advice = "is compressed as a whole; decompress it first: zstd -d"
     if packed and not files:
         raise BagError(path, f"{advice} {packed[0]}")
     if is_file:
         return BagFiles([path])
-    bag = BagFiles(lost=[CorruptRegion(name, 0, 0, f"{advice} {name}") for name in packed])
-    # Of ROS 1, which opening it names.
-    files = files or {file.name: file for file in inside if file.suffix == ".bag"}
+    # Those of ROS 1 are named when they are opened.
+    files = files or {file.name: file for file in entries if file.suffix == ".bag"}
     if not files:
         raise BagError(path, f"holds no {' or '.join(STORAGE_SUFFIXES)} file")
+    bag = BagFiles([*files.values()], [CorruptRegion(name, 0, 0, f"{advice} {name}") for name in packed])
     listed = [name.removesuffix(".zstd") for name in _read_metadata(path, bag)]
     if any(name in files for name in listed):
         absent = [name for name in listed if name not in files and f"{name}.zstd" not in packed]
@@ -283,16 +302,15 @@ def find_bag_files(path: Path) -> BagFiles:
         bag.remarks += [f"{name} is not read: {METADATA_FILE} does not list it" for name in files if name not in listed]
         bag.files = [files[name] for name in listed if name in files]
         return bag
-    bases = {(_by_number(file)[0], file.suffix) for file in files.values()}
-    if len(files) > 1 and (len(bases) > 1 or any(_by_number(file)[1] < 0 for file in files.values())):
-        kind = " and ".join(sorted({file.suffix for file in files.values()}, reverse=True))
-        raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
-    bag.files = [*files.values()]
+    numbers = [_by_number(file) for file in bag.files]
+    suffixes = sorted({file.suffix for file in bag.files}, reverse=True)
+    if len(files) > 1 and (len(suffixes) * len({base for base, _, _ in numbers}) > 1 or min(numbers)[1] < 0):
+        raise BagError(path, f"holds {len(files)} {' and '.join(suffixes)} files; name one of them")
     return bag
 
 
 def _by_number(path: Path) -> tuple[str, int, str]:
-    """Sort files of a split bag as they were recorded: bag_2 before bag_10."""
+    """Return a key that sorts files of a split bag as they were recorded: bag_2 before bag_10."""
     match = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
     return (match[1], int(match[2]), path.name) if match else (path.stem, -1, path.name)
 
@@ -306,21 +324,21 @@ def _read_metadata(folder: Path, bag: BagFiles) -> list[str]:
         information = yaml.load(text, yaml.CSafeLoader)["rosbag2_bagfile_information"]
         names = list(dict.fromkeys(Path(name).name for name in information["relative_file_paths"]))
         custom = {key: text for key, text in (information.get("custom_data") or {}).items() if isinstance(text, str)}
+        notes = {key.removeprefix(f"{NOTES}."): text for key, text in custom.items() if key.startswith(f"{NOTES}.")}
     except FileNotFoundError:
         return []
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
         problem = getattr(error, "strerror", None) or "is not what rosbag2 writes"
         bag.remarks.append(f"{METADATA_FILE} is not used: {problem}")
         return []
-    own = {key: custom.pop(key) for key in [*custom] if key.startswith(f"{NOTES}.")}
-    bag.notes = verified_notes({key.removeprefix(f"{NOTES}."): text for key, text in own.items()}) or {}
-    bag.custom_data = custom
+    bag.notes = verified_notes(notes) or {}
+    bag.custom_data = {key: text for key, text in custom.items() if not key.startswith(f"{NOTES}.")}
     return names
 
 
 def add_checksum(notes: Mapping[str, str]) -> dict[str, str]:
     """Return notes with their checksum, to be written."""
-    return {**notes, _CHECKSUM: f"{zlib.crc32(json.dumps(sorted(notes.items())).encode()):08x}"}
+    return {**notes, "crc32": f"{zlib.crc32(json.dumps(sorted(notes.items())).encode()):08x}"}
 
 
 def verified_notes(entries: Mapping[str, str], *, data_verified: bool = False) -> dict[str, str] | None:
@@ -330,7 +348,7 @@ def verified_notes(entries: Mapping[str, str], *, data_verified: bool = False) -
         entries: as they were read.
         data_verified: whether a checksum of the whole file is correct; then the notes need none of their own.
     """
-    notes = {key: value for key, value in entries.items() if key != _CHECKSUM}
+    notes = {key: value for key, value in entries.items() if key != "crc32"}
     return notes if data_verified or entries == add_checksum(notes) else None
 
 
@@ -342,9 +360,10 @@ def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
     Args:
         text: YAML, as a recorder keeps it with a topic.
     """
+    if len(text) >= 20_000 or "<<" in text:  # a publisher takes 400 characters; merged keys may double again and again
+        return []
     try:
-        is_plain = len(text) < MAX_QOS_CHARS and "<<" not in text
-        return [{**profile} for profile in dump_qos_v9(parse_qos(text))] if is_plain else []
+        return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return []
 

@@ -1,7 +1,7 @@
-"""Writes mcap bags by the package `mcap`, in small chunks, that stay readable after a crash or on a full disk.
+"""Writes and repairs bags: mcap in small chunks, by the package `mcap`, readable after a crash or on a full disk.
 
-Messages are taken by one thread and written by another, which no signal interrupts: the file stays whole whatever stops
-a recorder, and the callback that a message came by does not wait for the disk.
+Messages are written by a worker, which no signal interrupts: the file stays whole whatever stops a recorder, and the
+callback that a message came by does not wait for the disk.
 
 Source: the MCAP specification, https://mcap.dev/spec.
 """
@@ -11,39 +11,30 @@ from __future__ import annotations
 import errno
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from mcap.writer import Writer
 
+from magnetosuture_thread.bags import storage
 from magnetosuture_thread.bags.message_types import own_definition, typestore
-from magnetosuture_thread.bags.storage import (
-    METADATA_FILE,
-    NOTES,
-    QOS,
-    TYPE_HASH,
-    Connection,
-    MessageDefinition,
-    add_checksum,
-    jazzy_qos_profiles,
-    parse_qos_profiles,
-    pluralize,
-)
+from magnetosuture_thread.bags.storage import CDR, QOS, TYPE_HASH, Connection, MessageDefinition, pluralize
 from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
 
-Message = tuple[int, int, bytes, int, int]  # arguments of `mcap.writer.Writer.add_message`
+if TYPE_CHECKING:
+    from magnetosuture_thread.bags.reader import Bag
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
-DISK_FULL_TEXTS = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
+
+Message = tuple[int, int, bytes, int, int]  # arguments of `mcap.writer.Writer.add_message`
 
 
 class BagWriter:
@@ -73,7 +64,7 @@ class BagWriter:
     ) -> None:
         self.folder = folder
         self._file = folder / f"{name or folder.name}_0.mcap"
-        self._notes, self._custom_data = add_checksum(notes) if notes else {}, dict(custom_data or {})
+        self._notes, self._custom_data = storage.add_checksum(notes) if notes else {}, dict(custom_data or {})
         self._topics: dict[str, int] = {}
         self._connections: list[Connection] = []
         self._sequences: Counter[int] = Counter()
@@ -81,7 +72,7 @@ class BagWriter:
         self._bytes, self._first, self._last = 0, MAX_TIME, 0  # of the pending messages
         self._defined = 0  # connections when the last chunk was begun
         self._closed = False
-        # What follows is of the thread that writes.
+        # What follows is of the worker.
         self._schemas: dict[MessageDefinition, int] = {MessageDefinition(""): 0}
         self._registered = 0  # connections that the file has
         self._counts: Counter[int] = Counter()
@@ -92,12 +83,11 @@ class BagWriter:
             if any(folder.iterdir()):
                 raise BagError(folder, "is not empty; a bag is written to a new folder")
             self._stream = self._file.open("wb")
-            self._mcap: Any = Writer(
-                self._stream, chunk_size=MAX_TIME, enable_data_crcs=True
-            )  # chunks end by `flush` alone
+            # Chunks end by `flush` alone.
+            self._mcap: Any = Writer(self._stream, chunk_size=MAX_TIME, enable_data_crcs=True)
             self._mcap.start("ros2", "magnetosuture_thread")
-            if self._notes:
-                self._mcap.add_metadata(NOTES, self._notes)  # at the head of the file, where truncation leaves them
+            if self._notes:  # at the head of the file, where truncation leaves them
+                self._mcap.add_metadata(storage.NOTES, self._notes)
             self._mcap.flush()  # type: ignore[no-untyped-call]
         except OSError as error:
             with suppress(OSError):
@@ -111,9 +101,7 @@ class BagWriter:
         """Use the writer in a with statement, which closes it."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the bag, so that what was written can be read whatever happened."""
         self.close()
 
@@ -128,11 +116,11 @@ class BagWriter:
         Raises:
             BagError: the type is unknown, and no definition is given.
         """
-        own = own_definition(type_name)
-        definition = definition or own
+        ours = own_definition(type_name)
+        definition = definition or ours
         if not definition.text:
             raise BagError(topic, f"the type {type_name} has no definition")
-        type_hash = typestore().hash_rihs01(type_name) if definition == own else ""
+        type_hash = typestore().hash_rihs01(type_name) if definition == ours else ""
         connection = Connection(topic, definition, metadata={QOS: "", TYPE_HASH: type_hash})
         self._topics[topic] = self.add_connection(connection)
 
@@ -140,7 +128,7 @@ class BagWriter:
         """Add a connection, and return its number for `write_to`."""
         metadata = dict(connection.metadata)
         if QOS in metadata:
-            metadata[QOS] = jazzy_qos_profiles(metadata[QOS])
+            metadata[QOS] = storage.jazzy_qos_profiles(metadata[QOS])
         self._connections.append(replace(connection, metadata=metadata))
         return len(self._connections)
 
@@ -203,7 +191,8 @@ class BagWriter:
         self._worker.shutdown()
         if self._problem is not None:
             kept = pluralize(self._counts.total(), "message")
-            what = DISK_FULL_TEXTS.get(self._problem.errno or 0, f"fails ({self._problem.strerror})")
+            texts = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
+            what = texts.get(self._problem.errno or 0, f"fails ({self._problem.strerror})")
             raise RecordingEndedError(self.folder, f"the disk {what} after {kept}", self._file) from None
 
     def _write_chunk(self, pending: list[Message]) -> None:
@@ -252,14 +241,14 @@ class BagWriter:
         except OSError as error:
             self._fail(error)
             return
-        text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
+        metadata = self.folder / storage.METADATA_FILE
         try:
-            with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:
-                stream.write(text)
+            with metadata.open("w", encoding="utf-8") as stream:
+                yaml.safe_dump({"rosbag2_bagfile_information": information}, stream, sort_keys=False)
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:  # a part of it would be refused, where readers do without it
-            (self.folder / METADATA_FILE).unlink(missing_ok=True)
+            metadata.unlink(missing_ok=True)
             self._problem = error
 
     def _fail(self, problem: OSError) -> None:
@@ -272,24 +261,19 @@ class BagWriter:
     def _information(self) -> dict[str, Any]:
         """Return the content of metadata.yaml."""
         start = self._start if self._counts else 0
-        times = {
-            "starting_time": {"nanoseconds_since_epoch": start},
-            "duration": {"nanoseconds": self._end - start},
-        }
+        notes = {f"{storage.NOTES}.{key}": text for key, text in self._notes.items()}
+        times = {"starting_time": {"nanoseconds_since_epoch": start}, "duration": {"nanoseconds": self._end - start}}
         count = self._counts.total()
-        topics = [
-            {
-                "topic_metadata": {
-                    "name": connection.topic,
-                    "type": connection.type_name,
-                    "serialization_format": connection.serialization,
-                    "offered_qos_profiles": parse_qos_profiles(connection.metadata.get(QOS, "")),
-                    "type_description_hash": connection.metadata.get(TYPE_HASH, ""),
-                },
-                "message_count": self._counts[number],
+        topics = []
+        for number, connection in enumerate(self._connections, 1):
+            topic = {
+                "name": connection.topic,
+                "type": connection.type_name,
+                "serialization_format": connection.serialization,
+                "offered_qos_profiles": storage.parse_qos_profiles(connection.metadata.get(QOS, "")),
+                "type_description_hash": connection.metadata.get(TYPE_HASH, ""),
             }
-            for number, connection in enumerate(self._connections, 1)
-        ]
+            topics.append({"topic_metadata": topic, "message_count": self._counts[number]})
         return {
             "version": 9,  # of the format of metadata.yaml
             "storage_identifier": "mcap",
@@ -300,6 +284,88 @@ class BagWriter:
             "compression_mode": "",
             "relative_file_paths": [self._file.name],
             "files": [{"path": self._file.name, **deepcopy(times), "message_count": count}],  # YAML would write aliases
-            "custom_data": {**self._custom_data, **{f"{NOTES}.{key}": text for key, text in self._notes.items()}},
+            "custom_data": {**self._custom_data, **notes},
             "ros_distro": "jazzy",
         }
+
+
+@dataclass
+class RepairReport:
+    """Counts of what a repaired bag holds, lacks, and holds otherwise.
+
+    Attributes:
+        messages: that the new bag holds.
+        refused: messages that it does not, by reason.
+        dropped: other records that it does not, by kind.
+        unpacked: messages that the recorder had packed one by one, and that are not in the new bag.
+        defined: types that had no definition, and have ours.
+        rewritten: topics whose quality of service is written by name, as Jazzy reads it.
+    """
+
+    messages: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    unpacked: int = 0
+    defined: list[str] = field(default_factory=list)
+    rewritten: list[str] = field(default_factory=list)
+
+    @property
+    def is_same(self) -> bool:
+        """Return whether the new bag holds everything, as it was."""
+        return not (self.refused or self.dropped or self.unpacked or self.defined or self.rewritten)
+
+
+def write_repaired_bag(
+    bag: Bag, folder: Path, name: str, progress: Callable[[float], None] = lambda share: None
+) -> RepairReport:
+    """Write every message of a bag that can be vouched for into a new one, with its notes and definitions.
+
+    The bytes of messages and definitions stay as they are; so do times and numbers of messages, and entries of others
+    in metadata.yaml. Messages that the recorder packed one by one are unpacked, and topics have their remapped names.
+    Types keep the definitions of the bag; ours is written where it has none and we know the type. Chunks, indices,
+    statistics and metadata.yaml are made anew. Attachments and metadata records of others are counted and not kept.
+
+    Args:
+        bag: the bag to repair.
+        folder: of the new one; must be empty.
+        name: of the new one.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: the new bag cannot be written.
+    """
+    notes = dict(bag.notes)
+    if bag.has_no_checksum and not bag.salvaged_without_checksum:
+        notes.setdefault(storage.NO_CHECKSUM_NOTE, f"made by `bag repair` from a bag that {bag.has_no_checksum}")
+    report = RepairReport(dropped=bag.others)
+    with BagWriter(folder, notes, name=name, custom_data=bag.custom_data) as writer:
+        connections = dict.fromkeys(bag.connections())
+        numbers = {old: writer.add_connection(_repaired_connection(bag, old, report)) for old in connections}
+        for item in bag.stored():
+            try:
+                if item.time > MAX_TIME:
+                    raise BagError(bag.name_of(item.connection), "a time that cannot be")
+                data = bag.load(item)
+            except BagError as error:
+                report.refused[str(error)] += 1
+                continue
+            number, publish_time, sequence = numbers[item.connection], item.publish_time, item.sequence
+            writer.write_to(number, item.time, data, publish_time=publish_time, sequence=sequence)
+            report.messages += 1
+            report.unpacked += data is not item.data
+            progress((item.time - bag.start) / max(bag.end - bag.start, 1))
+    return report
+
+
+def _repaired_connection(bag: Bag, connection: Connection, report: RepairReport) -> Connection:
+    """Return a connection as it is in the new bag: under its remapped name, with our definition where it has none."""
+    definition = connection.definition
+    if not definition.text and connection.serialization == CDR:
+        ours = own_definition(definition.type_name)
+        if ours.text:
+            definition = ours
+            report.defined.append(ours.type_name)
+    profiles = connection.metadata.get(QOS, "")
+    if storage.jazzy_qos_profiles(profiles) != profiles:
+        report.rewritten.append(bag.name_of(connection))
+    return replace(connection, topic=bag.name_of(connection), definition=definition)

@@ -10,9 +10,10 @@ from typing import Any
 
 from rich.table import Table
 
-from magnetosuture_thread.bags.check import inspect_bag, write_repaired_bag
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.recording import inspect_bag
 from magnetosuture_thread.bags.storage import pluralize, silence_text
+from magnetosuture_thread.bags.writer import write_repaired_bag
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.settings.errors import one_line
 from magnetosuture_thread.settings.files import whole_folder

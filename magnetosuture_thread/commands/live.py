@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.evaluation import recorded, replay
-from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
+from magnetosuture_thread.evaluation.frames import CurrentSeries, GraphCollector
 from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, stage_latencies
+from magnetosuture_thread.evaluation.tables import ReplaySummary
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.nodes import topics
@@ -304,7 +305,7 @@ def _summary(
     given: recorded.BagInput, folder: Path, live: LiveReplay, **others: Any
 ) -> tuple[RunMetrics, ReplaySummary]:
     """Compare the outputs with what the bag holds."""
-    collector = GraphCollector(given.setup.model.thread_length)
+    collector = GraphCollector()
     before, replayed = CurrentSeries(), CurrentSeries()
     truth = interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL
     expected = [c for c in (*truth, interface.CURRENTS) if given.recording.counts.get(c.recorded)]
@@ -319,7 +320,8 @@ def _summary(
         collector.add(record.topic, message)
         if record.topic == interface.CURRENTS.recorded:
             replayed.add(message)
-    metrics, losses = collector.metrics(given.recording.start), live.losses
+    length, losses = given.setup.model.thread_length, live.losses
+    metrics = RunMetrics.of(length, collector.frames(), given.recording.start)
     frames, things, channel = losses.frames_played, "frames", given.recording.camera
     if given.source == "poses":
         frames, things, channel = losses.played[interface.NEEDLE_POSE.name], "poses", interface.NEEDLE_POSE

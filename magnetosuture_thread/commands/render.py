@@ -12,7 +12,7 @@ import numpy as np
 
 from magnetosuture_thread import Attachment, ConfigurationError, Disc
 from magnetosuture_thread.bags import packing
-from magnetosuture_thread.bags.scene_message import packed_scene
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory, read_reference

@@ -18,9 +18,9 @@ from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.commands.command import DONE, Terminal, add_actions, make_table
 from magnetosuture_thread.commands.simulate import measure_loop, simulate
 from magnetosuture_thread.evaluation.frames import FrameResult
-from magnetosuture_thread.evaluation.graph_outputs import LoopSummary
 from magnetosuture_thread.evaluation.recorded import read_image
 from magnetosuture_thread.evaluation.replay import picture_or_log
+from magnetosuture_thread.evaluation.tables import LoopSummary
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.errors import BagError

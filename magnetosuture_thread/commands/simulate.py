@@ -17,10 +17,9 @@ from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
-from magnetosuture_thread.evaluation.tables import loop_table, outcome_line
+from magnetosuture_thread.evaluation.tables import LoopCollector, LoopSummary, loop_table, outcome_line
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.nodes import clients, topics

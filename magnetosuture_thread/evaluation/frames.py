@@ -1,35 +1,32 @@
-"""Frames of a run, measured and predicted, and what is kept of them: columns and error map."""
+"""Frames of a run, measured and predicted, also by the messages of a graph; and what is kept: columns, error map."""
 
 from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.bags.reading import margins_of, nanoseconds, thread_observation
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.margins import Margins, node_clearance
 from magnetosuture_thread.thread.prediction import Prediction
 
 Array = NDArray[np.float64]
 
+_no_numbers, _no_points = partial(np.empty, 0), partial(np.empty, (0, 2))
 MARGIN = "margin_"  # columns of margins, by the barrier's name
 SILENT_PERIODS = 5.0  # usual intervals; a longer one without frames is a gap
-
-
-def _nothing() -> Array:
-    return np.empty(0)
-
-
-def _no_points() -> Points:
-    return np.empty((0, 2))
 
 
 @dataclass
@@ -51,15 +48,15 @@ class Observation:
     """
 
     stamp: int
-    tail: Array = field(default_factory=_nothing)
-    heading: Array = field(default_factory=_nothing)
+    tail: Array = field(default_factory=_no_numbers)
+    heading: Array = field(default_factory=_no_numbers)
     measured: Points = field(default_factory=_no_points)
     ground_truth: Points = field(default_factory=_no_points)
     reason: str = ""
     processing: float = math.nan
     observation: ThreadObservation | None = None
     deviation: tuple[float, float] = (0.0, 0.0)
-    true_pull: Array = field(default_factory=_nothing)
+    true_pull: Array = field(default_factory=_no_numbers)
     recorded: Points = field(default_factory=_no_points)
 
     @property
@@ -70,7 +67,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class EstimatedThread:
-    """What is kept of a thread's estimate.
+    """A thread's estimate, as far as it is kept.
 
     Attributes:
         vertices: shape (n + 1, 2) [m].
@@ -82,14 +79,16 @@ class EstimatedThread:
 
     vertices: Points
     corrected: bool = False
-    squared: Array = field(default_factory=_nothing)
+    squared: Array = field(default_factory=_no_numbers)
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
 
     @classmethod
-    def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
-        """Return what is kept of an estimate."""
-        squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
+    def of(cls, estimate: ThreadEstimate | None, prediction: Prediction) -> EstimatedThread:
+        """Return what is kept of an estimate; without one the prediction stands for it."""
+        if estimate is None:
+            return cls(prediction.positions)
+        squared = _no_numbers() if estimate.innovations is None else estimate.innovations.normalised_squared
         return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
 
 
@@ -115,7 +114,7 @@ class FrameResult(Observation):
     residual: float = math.nan
     step_time: float = math.nan
     tension: float = math.nan
-    pull: Array = field(default_factory=_nothing)
+    pull: Array = field(default_factory=_no_numbers)
     margins: Margins | None = None
     obstacles: tuple[Obstacle, ...] = ()
     errors: dict[str, float] = field(default_factory=dict)
@@ -123,15 +122,7 @@ class FrameResult(Observation):
 
     @classmethod
     def of(
-        cls,
-        observation: Observation,
-        prediction: Prediction,
-        margins: Margins | None,
-        step_time: float,
-        *,
-        estimate: ThreadEstimate | None = None,
-        estimated: bool = False,
-        obstacles: tuple[Obstacle, ...] = (),
+        cls, observation: Observation, prediction: Prediction, margins: Margins | None, step_time: float
     ) -> FrameResult:
         """Return a prediction with the observation that it is of.
 
@@ -140,11 +131,7 @@ class FrameResult(Observation):
             prediction: of it.
             margins: of the prediction, if they prove anything.
             step_time: that the prediction took [s].
-            estimate: of the same frame.
-            estimated: whether the thread is estimated in this run; without an estimate the prediction stands for it.
-            obstacles: in force.
         """
-        instead = EstimatedThread(prediction.positions) if estimated else None
         forces = prediction.forces
         return cls(
             **vars(observation),
@@ -153,10 +140,8 @@ class FrameResult(Observation):
             residual=prediction.residual,
             step_time=step_time,
             tension=math.nan if forces is None else forces.peak_tension,
-            pull=np.empty(0) if forces is None else np.asarray(forces.needle_force),
+            pull=_no_numbers() if forces is None else np.asarray(forces.needle_force),
             margins=margins,
-            obstacles=obstacles,
-            estimate=instead if estimate is None else EstimatedThread.of(estimate),
         )
 
     def target_curve(self, target: str) -> Points:
@@ -207,11 +192,6 @@ class TimeSeries:
         self._times.append(time)
         for name, column in self._columns.items():
             column.append(values.get(name, math.nan))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-        return tuple(self._columns)
 
     @property
     def times(self) -> Array:
@@ -300,3 +280,146 @@ class ErrorMap:
         times, errors = with_gaps(np.array(self._times), np.column_stack(self._columns))
         rows = errors.shape[0]
         return times, self._length * np.arange(1, rows + 1) / rows, errors
+
+
+@dataclass(frozen=True)
+class CurrentDifference:
+    """Difference of the currents of a replay from the recorded ones, at the times of the replay's.
+
+    In places the coils can give the same velocity in two ways, far apart, and change from one to the other
+    within a hundredth of a second: the greatest differences are of such moments.
+
+    Attributes:
+        compared: how many replayed currents have a recorded one beside them.
+        difference: of a coil, median [A].
+        p99: 99th percentile [A].
+        greatest: [A].
+        recorded: root of the mean square of the recorded currents, to judge the difference by [A].
+        stopped_apart: share of the compared of which one is a stop and the other is not.
+    """
+
+    compared: int
+    difference: float
+    p99: float
+    greatest: float
+    recorded: float
+    stopped_apart: float
+
+
+class CurrentSeries:
+    """Currents over time, from messages in any order of arrival."""
+
+    def __init__(self) -> None:
+        self._received: dict[int, tuple[Array, bool]] = {}
+
+    def add(self, message: Any) -> None:
+        """Add a message CoilCurrents, of ROS or of the bags' type store."""
+        stamp = nanoseconds(message.header.stamp)
+        self._received[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
+
+    def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
+        """Compare with the currents in force when recorded; None where nothing can be."""
+        stamps, replayed = np.array(sorted(recorded._received), np.int64), sorted(self._received)
+        pairs = []
+        for stamp, index in zip(replayed, np.searchsorted(stamps, replayed, side="right") - 1, strict=True):
+            if index >= 0 and stamp - stamps[index] <= 50_000_000:  # ns, for which currents are in force
+                now, then = self._received[stamp], recorded._received[int(stamps[index])]
+                if now[0].shape == then[0].shape:
+                    pairs.append((now, then))
+        if not pairs:
+            return None
+        difference = np.abs([now[0] - then[0] for now, then in pairs])
+        median, p99, greatest = np.percentile(difference, (50, 99, 100)).tolist()
+        level = rms(np.array([then[0] for _, then in pairs]))
+        stopped_apart = float(np.mean([now[1] != then[1] for now, then in pairs]))
+        return CurrentDifference(len(pairs), median, p99, greatest, level, stopped_apart)
+
+
+class GraphCollector:
+    """Puts messages side by side by the stamp of the frame that they are about.
+
+    Takes decoded messages, of ROS or of the bags' type store alike: only fields are read.
+
+    Attributes:
+        poses: frames in which the needle was found.
+        applied: stamps of the commands that were followed, not stopped [ns].
+        health: what each node reported last of itself.
+    """
+
+    def __init__(self) -> None:
+        self._frames: dict[int, FrameResult] = {}
+        self.poses = 0
+        self.applied: set[int] = set()
+        self.health: dict[str, str] = {}
+
+    def add(self, topic: str, message: Any) -> None:
+        """Add one message; topics that concern no frame are ignored, and a later message of a frame counts."""
+        match topic:
+            case interface.DIAGNOSTICS.recorded:
+                self.health.update({status.name.split(":")[0]: status.message for status in message.status})
+            case interface.CURRENTS.recorded if not message.stop:
+                self.applied.add(nanoseconds(message.command))
+            case interface.NEEDLE_POSE.recorded:
+                self.poses += 1
+            case interface.MEASURED_THREAD.recorded:
+                self._of(message).measured = _points(stamped.pose.position for stamped in message.poses)
+            case interface.GROUND_TRUTH_THREAD.recorded:
+                self._of(message).ground_truth = _points(stamped.pose.position for stamped in message.poses)
+            case interface.GROUND_TRUTH_PULL.recorded:
+                self._of(message).true_pull = _in_plane(message.wrench.force)
+            case interface.THREAD_OBSERVATION.recorded:
+                try:
+                    observation = thread_observation(message, interface.THREAD_OBSERVATION.name)
+                except InvalidInputError:
+                    observation = ThreadObservation()
+                self._of(message).observation = observation
+            case interface.ESTIMATED_THREAD.recorded:
+                self._of(message).estimate = _estimate(message)
+            case interface.MARGINS.recorded if message.valid:
+                self._of(message).margins = margins_of(message)
+            case interface.PREDICTED_THREAD.recorded:
+                frame = self._of(message)
+                frame.vertices = _points(message.positions)
+                frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
+                frame.residual, frame.step_time = message.residual, message.step_time
+                if len(tension := getattr(message, "tension", ())):  # older bags have none
+                    frame.tension, frame.pull = float(np.max(tension)), _in_plane(message.needle_force)
+
+    def _of(self, message: Any) -> FrameResult:
+        """Return the frame that a message is about."""
+        stamp = nanoseconds(message.header.stamp)
+        return self._frames.setdefault(stamp, FrameResult(stamp))
+
+    def frames(self, first: int = 0, last: int | None = None) -> list[FrameResult]:
+        """Return the frames with a prediction, by time; their errors are set by `RunMetrics`.
+
+        Args:
+            first: stamp of the first one [ns].
+            last: stamp of the last one; of all if None.
+        """
+        last = max(self._frames, default=0) if last is None else last
+        return [frame for at, frame in sorted(self._frames.items()) if len(frame.vertices) and first <= at <= last]
+
+
+def _estimate(message: Any) -> EstimatedThread:
+    disturbances = []
+    for contact in message.disturbances:
+        place, direction, since = contact.position, contact.direction, nanoseconds(contact.since) * 1e-9
+        vectors, force = (_in_plane(place), _in_plane(direction)), (contact.force, contact.significance)
+        disturbances.append(Disturbance(contact.arc_length, contact.extent, *vectors, *force, since))
+    degrees, vertices = int(message.innovation_degrees), _points(message.positions)
+    squared = np.full(degrees, message.innovation_squared / max(degrees, 1))
+    return EstimatedThread(vertices, not message.prediction_only, squared, tuple(disturbances), message.hidden)
+
+
+def _in_plane(vector: Any) -> Array:
+    return np.array([vector.x, vector.y])
+
+
+def _points(points: Iterable[Any]) -> Points:
+    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
+
+
+def rms(values: Array) -> float:
+    """Return the root of the mean square; nan of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -42,10 +42,8 @@ from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 
 RATE = 33.0  # Hz, of the paper's simulation
 COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge
-SHOWN = (0.0, 12.0, 17.0, 27.0, 35.0, 55.0)  # s; the six instants of the paper's figure
 PAPER_SEGMENTS = 40  # of the thread in the paper's figure
 NODE_COLOURS = ("#0b3c5d", "#1f77b4", "#2a9d8f", "#8ab17d", "#e9a03b")  # of the first nodes, whose barriers are drawn
-_MAX_DISTANCE = 1.0  # m; farther than any obstacle of a dish
 _AHEAD = np.array([1.0, 0.0])  # a point has no heading, and a thread that turns freely asks for none
 
 
@@ -120,11 +118,9 @@ class SteeredThread:
             InvalidInputError: the velocity is not finite, or beyond 1 m/s.
             SolverError: a program had no solution, or its linearisation did not converge.
         """
-        began = perf_counter()
-        if not (np.isfinite(commanded).all() and math.hypot(*commanded.tolist()) <= 1.0):
-            expected = "finite numbers, at most 1 m/s"  # what commands more was meant in another unit
-            raise InvalidInputError("needle velocity", commanded.tolist(), expected)
-        slowdown = self.now.margins.friction.slowdown
+        began, slowdown = perf_counter(), self.now.margins.friction.slowdown
+        if not math.hypot(*commanded.tolist()) <= 1.0:  # what commands more was meant in another unit
+            raise InvalidInputError("needle velocity", commanded.tolist(), "finite numbers, at most 1 m/s")
         command = self._needle.filter(commanded, self._tail, _AHEAD, slowdown=slowdown)
         self._tail = self._tail + interval * command.filtered
         self._stamp += round(interval * 1e9)
@@ -135,12 +131,12 @@ class SteeredThread:
         outcome = self._session.on_pose(self._stamp, NeedlePose(self._stamp * 1e-9, self._tail, _AHEAD))
         if outcome.problem is not None:
             raise outcome.problem
-        prediction, margins = outcome.prediction, outcome.margins
+        prediction = outcome.prediction
         assert prediction is not None
-        if margins is None:
+        if outcome.margins is None:
             raise SolverError(prediction.solver, prediction.status, prediction.residual, 0.0)
         took = perf_counter() - began if command is not None else 0.0
-        return SteeredInstant(self._stamp * 1e-9, prediction, margins, command, took)
+        return SteeredInstant(self._stamp * 1e-9, prediction, outcome.margins, command, took)
 
 
 class RecordedCommands(NamedTuple):
@@ -157,9 +153,8 @@ class RecordedCommands(NamedTuple):
     def at(self, time: float) -> NDArray[np.float64]:
         """Return the velocity commanded at a time [s], shape (2,) [m/s]; zero where no command is valid."""
         index = int(np.searchsorted(self.times, time + 1e-9, side="right")) - 1
-        if index < 0 or time - self.times[index] > COMMAND_TIMEOUT + 1e-9:
-            return np.zeros(2)
-        return np.asarray(self.velocities[index])
+        is_valid = index >= 0 and time - self.times[index] <= COMMAND_TIMEOUT + 1e-9
+        return np.asarray(self.velocities[index]) if is_valid else np.zeros(2)
 
 
 @dataclass(frozen=True)
@@ -187,9 +182,8 @@ class HerniaRun:
     @property
     def shown(self) -> list[SteeredInstant]:
         """The instants to show: those of the paper, or as many spread evenly over a run that ends before."""
-        end = self.instants[-1].time
-        times = SHOWN if end >= SHOWN[-1] else np.linspace(0.0, end, len(SHOWN)).tolist()
-        return [self.nearest(time) for time in times]
+        end, paper = self.instants[-1].time, (0.0, 12.0, 17.0, 27.0, 35.0, 55.0)  # s
+        return [self.nearest(time) for time in (paper if end >= paper[-1] else np.linspace(0.0, end, 6).tolist())]
 
     def figures(self, setup: str) -> dict[str, Any]:
         """Return the figures, as JSON has them, in SI units; `setup` is the setup's name.
@@ -199,9 +193,8 @@ class HerniaRun:
         99th percentile, are wall-clock times of a whole step; and `room` says how many fit into its period.
         """
         steps = self.instants[1:]
-        took = np.array([step.took for step in steps])
+        median, high = np.percentile([step.took for step in steps], (50.0, 99.0)).tolist()
         nearest = min(step.margins["obstacle"].minimum for step in self.instants)
-        median = float(np.median(took))
         return {
             "setup": setup,
             "formulation": self.settings.formulation,
@@ -214,7 +207,7 @@ class HerniaRun:
             "most_friction": max(len(step.margins.friction.nodes) for step in steps),
             "slowest": min(step.margins.friction.slowdown for step in steps),
             "median_step": median,
-            "high_step": float(np.percentile(took, 99.0)),
+            "high_step": high,
             "instants": [instant.figures() for instant in self.shown],
             "room": 1.0 / (RATE * median),
             "simulated": "the thread model alone, the needle a point",
@@ -253,28 +246,25 @@ def replay_steering(
         InvalidInputError: the thread cannot begin there, or a velocity cannot be used.
         SolverError: a step had no solution.
     """
-    around = Workspace(needle.scene.obstacles, _MAX_DISTANCE)
     thread = SteeredThread(settings, centreline, needle)
     instants = [thread.now]
     count = math.ceil((commands.times[-1] + COMMAND_TIMEOUT) * RATE) if len(commands.times) else 0
     for k in range(count):
         instants.append(thread.step(1.0 / RATE, commands.at(k / RATE)))
         progress((k + 1) / count)
+    farthest = 1.0  # m; farther than any obstacle of a dish
+    around = Workspace(needle.scene.obstacles, farthest)
+
+    def distances(points: Points) -> NDArray[np.float64]:  # of each from each obstacle, signed [m]
+        near, distances = around.near(points), np.full((len(points), len(around.shapes)), farthest)
+        np.minimum.at(distances, (near.node, near.obstacle), near.distance)
+        return distances
+
     positions = [instant.prediction.positions for instant in instants]
-    barriers = np.array([_distances(around, points[1 : 1 + len(NODE_COLOURS)]) for points in positions])
-    nearest = min(
-        _distances(around, 0.5 * (points[1:] + points[:-1])).min(initial=_MAX_DISTANCE) for points in positions
-    )
+    barriers = np.array([distances(points[1 : 1 + len(NODE_COLOURS)]) for points in positions])
+    nearest = min(distances(0.5 * (points[1:] + points[:-1])).min(initial=farthest) for points in positions)
     radius = 0.5 * settings.thread().diameter
     return HerniaRun(settings, needle.scene, instants, barriers - radius, max(0.0, -float(nearest)))
-
-
-def _distances(around: Workspace, points: Points) -> NDArray[np.float64]:
-    """Return the signed distance of each point from each obstacle, shape (m, obstacles) [m]."""
-    near = around.near(points)
-    distances = np.full((len(points), len(around.shapes)), _MAX_DISTANCE)
-    np.minimum.at(distances, (near.node, near.obstacle), near.distance)
-    return distances
 
 
 def replay_hernia(
@@ -318,8 +308,9 @@ def replay_hernia(
         run = replay_steering(settings, start_centreline(setup), steering, needle, progress)
         figures = run.figures(setup.name)
         (folder / "hernia.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        for name, draw in {"hernia.png": draw_hernia, **({"hernia.gif": draw_animation} if animation else {})}.items():
-            if picture := picture_or_log(partial(draw, run), log):
+        pictures = {"hernia.png": draw_hernia, "hernia.gif": draw_animation if animation else None}
+        for name, draw in pictures.items():
+            if draw is not None and (picture := picture_or_log(partial(draw, run), log)):
                 (folder / name).write_bytes(picture)
     return figures
 
@@ -333,8 +324,6 @@ def read_steering(bag: Bag) -> RecordedCommands:
     Recording(bag).require(OPERATOR_COMMAND)
     messages = [record.decode() for record in bag.records({OPERATOR_COMMAND.recorded})]
     stamps = np.array([seconds(message.header.stamp) for message in messages])
-    if not len(stamps):
-        raise BagError(bag.path, f"holds no message on {OPERATOR_COMMAND.recorded}")
     if not (np.diff(stamps) >= 0.0).all():
         raise BagError(bag.path, f"has stamps on {OPERATOR_COMMAND.recorded} that do not rise")
     velocities = np.array([(message.twist.linear.x, message.twist.linear.y) for message in messages])

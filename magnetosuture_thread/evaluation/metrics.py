@@ -6,25 +6,19 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import asdict, dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from magnetosuture_thread.evaluation.frames import (
-    SILENT_PERIODS,
-    Array,
-    ErrorMap,
-    FrameResult,
-    Observation,
-    TimeSeries,
-    WorstFrame,
-)
+from magnetosuture_thread.evaluation import frames
+from magnetosuture_thread.evaluation.frames import Array, ErrorMap, FrameResult, TimeSeries, WorstFrame
 from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.settings.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
-from magnetosuture_thread.thread.margins import SOLID, Margins
+from magnetosuture_thread.thread.margins import SOLID, BarrierMargins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
@@ -42,9 +36,9 @@ class Percentiles:
     @classmethod
     def of(cls, values: ArrayLike) -> Percentiles | None:
         """Return the percentiles of the finite values, or None if there are none."""
-        given = np.asarray(values, dtype=np.float64)
-        kept = given[np.isfinite(given)]
-        return cls(*np.percentile(kept, (50, 99, 100)).tolist()) if len(kept) else None
+        numbers = np.asarray(values, dtype=np.float64)
+        finite = numbers[np.isfinite(numbers)]
+        return cls(*np.percentile(finite, (50, 99, 100)).tolist()) if len(finite) else None
 
 
 def finite_or_none(value: Any) -> Any:
@@ -54,10 +48,9 @@ def finite_or_none(value: Any) -> Any:
 
 def error_figures(errors: Array) -> dict[str, float] | None:
     """Return count, mean, median, p99 and maximum of errors in %; None if there are none."""
-    percentiles = Percentiles.of(errors)
-    if percentiles is None:
-        return None
-    return {"count": int(np.isfinite(errors).sum()), "mean": float(np.nanmean(errors)), **asdict(percentiles)}
+    finite = errors[np.isfinite(errors)]
+    percentiles = Percentiles.of(finite)
+    return {"count": len(finite), "mean": float(finite.mean()), **asdict(percentiles)} if percentiles else None
 
 
 def stage_latencies(
@@ -72,12 +65,12 @@ def stage_latencies(
     """
     camera = {stamp: at for channel in CAMERA.values() for stamp, at in published.get(channel.name, {}).items()}
     commands = {stamp: at for stamp, at in published.get(NEEDLE_COMMAND.name, {}).items() if stamp in applied}
-    poses, predictions = arrived.get(NEEDLE_POSE.name, {}), arrived.get(PREDICTED_THREAD.name, {})
+    poses, predictions, currents = (arrived.get(c.name, {}) for c in (NEEDLE_POSE, PREDICTED_THREAD, CURRENTS))
     stages: dict[str, tuple[Mapping[int, float], Mapping[int, float]]] = {
         "frame to needle pose": (camera, poses),
         "pose to prediction": (poses, predictions),
         "frame to prediction": (camera, predictions),
-        "command to currents": (commands, arrived.get(CURRENTS.name, {})),
+        "command to currents": (commands, currents),
     }
     return {
         stage: Percentiles.of([after[stamp] - before[stamp] for stamp in after if stamp in before])
@@ -151,7 +144,7 @@ def prediction_error_percent(vertices: Points, curve: Points, length: float) -> 
 
 @dataclass(frozen=True)
 class SensorSilence:
-    """Time without frames, or recorded poses: gaps of more than `SILENT_PERIODS` usual intervals.
+    """Time without frames, or recorded poses: gaps of more than `frames.SILENT_PERIODS` usual intervals.
 
     Attributes:
         gaps: how many.
@@ -165,14 +158,10 @@ class SensorSilence:
     max_gap: float = 0.0
     at: float = math.nan
 
-    @property
-    def longest(self) -> str:
-        """The longest gap in words."""
-        return f"{self.max_gap:.1f} s at the longest, from {self.at:.2f} s on"
-
     def __str__(self) -> str:
         """Return the gaps in words; empty if there are none."""
-        return f"without frames for {self.total:.1f} s, {self.longest}" if self.gaps else ""
+        longest = f"{self.max_gap:.1f} s at the longest, from {self.at:.2f} s on"
+        return f"without frames for {self.total:.1f} s, {longest}" if self.gaps else ""
 
     @classmethod
     def of(cls, times: Array, begin: float, end: float) -> SensorSilence:
@@ -193,7 +182,7 @@ class SensorSilence:
         times = within if 2 * len(within) > len(times) else times
         edges = np.concatenate([[begin], times, [end]]) if times is within else times
         steps = np.diff(edges)
-        gaps = steps[steps > SILENT_PERIODS * float(np.median(np.diff(times)))]
+        gaps = steps[steps > frames.SILENT_PERIODS * float(np.median(np.diff(times)))]
         if not len(gaps):
             return cls()
         longest = int(np.argmax(steps))
@@ -222,7 +211,7 @@ class MinimumMargin:
 
     @property
     def promised(self) -> float:
-        """What the barrier keeps at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
+        """Margin that is kept at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
         return self.value if self.kind in SOLID else self.clearance
 
     @property
@@ -257,7 +246,7 @@ def hidden_part(frame: FrameResult, length: float) -> float:
 
 @dataclass(frozen=True)
 class HiddenShares:
-    """How much of the thread was hidden, for how long. Each frame counts for the time until the next one.
+    """Hidden shares of thread and time. Each frame counts for the time until the next one.
 
     Attributes:
         time: share of the time in which a part of the thread was hidden: more than 3 % of its length.
@@ -279,7 +268,7 @@ class HiddenShares:
         steps = np.diff(series.times)
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
         durations = np.append(steps, usual)  # the usual interval for the last one, and before a gap
-        durations = np.where((durations > 0.0) & (durations <= SILENT_PERIODS * usual), durations, usual)
+        durations = np.where((durations > 0.0) & (durations <= frames.SILENT_PERIODS * usual), durations, usual)
         shares = np.array([hidden > 0.03, corrected == 0.0, hidden])[:, known]
         return cls(*np.average(shares, axis=1, weights=durations[known]).tolist())
 
@@ -292,8 +281,7 @@ def mean_band(count: Array) -> tuple[Array, Array]:
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
     5.4. Deviation: none.
     """
-    low, high = (np.asarray(chdtri(count, above) / count) for above in (0.975, 0.025))
-    return low, high
+    return np.asarray(chdtri(count, 0.975) / count), np.asarray(chdtri(count, 0.025) / count)
 
 
 @dataclass(frozen=True)
@@ -305,21 +293,17 @@ class Consistency:
     filter knows how wrong it is; one above the band that it trusts itself too much.
 
     Attributes:
-        begins: of each window, since the bag's start, shape (k,) [s].
-        width: of each [s].
+        width: of each window [s].
         means: of the normalised innovations squared, shape (k,); nan where nothing was measured.
-        low: lower end of the band of each, shape (k,).
-        high: upper end of it, shape (k,).
+        high: upper end of the band of each, shape (k,).
         mean: of all normalised innovations squared.
         windows: number of windows in which anything was measured.
         within: number of windows whose mean is within its band.
         band: of a usual window: the median of both ends.
     """
 
-    begins: Array
     width: float
     means: Array
-    low: Array
     high: Array
     mean: float
     windows: int
@@ -340,13 +324,9 @@ class Consistency:
         count = np.bincount(index, counts, windows).astype(np.float64)
         count[count == 0.0] = np.nan
         means, (low, high) = np.bincount(index, squared * counts, windows) / count, mean_band(count)
-        within = int(((low <= means) & (means <= high)).sum())
-        mean, band = (
-            float((squared * counts).sum() / counts.sum()),
-            (float(np.nanmedian(low)), float(np.nanmedian(high))),
-        )
-        begins = first + width * np.arange(windows, dtype=np.float64)
-        return cls(begins, width, means, low, high, mean, int(np.isfinite(means).sum()), within, band)
+        within, band = int(((low <= means) & (means <= high)).sum()), (np.nanmedian(low), np.nanmedian(high))
+        mean = float((squared * counts).sum() / counts.sum())
+        return cls(width, means, high, mean, int(np.isfinite(means).sum()), within, (float(band[0]), float(band[1])))
 
 
 @dataclass(frozen=True)
@@ -386,21 +366,21 @@ def compare_errors(series: TimeSeries) -> dict[str, dict[str, float | None]]:
     Args:
         series: columns of a run.
     """
-    found: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
-    for kind, own in KINDS.items():
+    errors: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
+    for kind, prefix in KINDS.items():
         for name, target in (("ground_truth", "truth"), ("measured", "seen")):
-            means, nodes = series.known(f"{own}error_{target}"), series.known(f"max_node_{own}error_{target}")
-            found[kind] |= {
+            means, nodes = series.known(f"{prefix}error_{target}"), series.known(f"max_node_{prefix}error_{target}")
+            errors[kind] |= {
                 f"error_{name}_mean_percent": float(means.mean()) if len(means) else None,
                 f"error_{name}_max_percent": float(means.max()) if len(means) else None,
                 f"error_{name}_max_node_percent": float(nodes.max()) if len(nodes) else None,
             }
-    return found
+    return errors
 
 
 @dataclass(frozen=True)
 class EstimationFigures:
-    """What a run tells of its estimate beside the errors.
+    """Figures of a run's estimate beside the errors.
 
     Attributes:
         corrected: number of frames whose estimate took a measurement; of the others it is a prediction only.
@@ -414,25 +394,21 @@ class EstimationFigures:
     hidden: HiddenShares | None = None
     disturbances: tuple[DisturbanceEvent, ...] = ()
 
-    @property
-    def estimated(self) -> bool:
-        """Whether the thread was estimated at all."""
-        return self.hidden is not None
-
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none."""
-        hidden, found = self.hidden, self.consistency
+        hidden, consistency = self.hidden, self.consistency
+        windows = {
+            "normalised_innovation_squared_mean": consistency.mean if consistency else None,
+            "band_95_low": consistency.band[0] if consistency else None,
+            "band_95_high": consistency.band[1] if consistency else None,
+            "window_s": consistency.width if consistency else None,
+            "windows": consistency.windows if consistency else 0,
+            "windows_within_band": consistency.within if consistency else 0,
+            "windows_within_band_share": consistency.within / consistency.windows if consistency else None,
+        }
         return {
             "corrected_frames": self.corrected,
-            "consistency": {
-                "normalised_innovation_squared_mean": found.mean if found else None,
-                "band_95_low": found.band[0] if found else None,
-                "band_95_high": found.band[1] if found else None,
-                "window_s": found.width if found else None,
-                "windows": found.windows if found else 0,
-                "windows_within_band": found.within if found else 0,
-                "windows_within_band_share": found.within / found.windows if found else None,
-            },
+            "consistency": windows,
             "hidden_time_share": hidden.time if hidden else None,
             "all_hidden_time_share": hidden.all_time if hidden else None,
             "hidden_length_share": hidden.length if hidden else None,
@@ -472,7 +448,15 @@ class RunMetrics:
         self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
         self._worst: dict[str, WorstFrame] = {}
 
-    def observe(self, observation: Observation) -> None:
+    @classmethod
+    def of(cls, length: float, frames: Iterable[FrameResult], start: int = 0) -> RunMetrics:
+        """Return the figures of frames by time."""
+        metrics = cls(length, start)
+        for frame in frames:
+            metrics.add(frame)
+        return metrics
+
+    def observe(self, observation: frames.Observation) -> None:
         """Count a frame, or a recorded pose, and whether its needle was found."""
         columns = {"processing": observation.processing, "tracked": float(observation.found)}
         self.observed.add(self._time(observation.stamp), columns)
@@ -491,44 +475,35 @@ class RunMetrics:
         self._worst.setdefault("", WorstFrame(time, math.nan, frame))
         if frame.margins is not None:
             self.contact_frames += bool(frame.margins.in_contact)
-            self._lower(time, frame.margins)
-        self._take_disturbances(time, frame)
+            for rows in filter(len, frame.margins.barriers):
+                self._lower_minimum(time, rows)
+        self._add_disturbance(time, frame)
         columns = frame.columns() | {"hidden": hidden_part(frame, self.length)} | self._compare(time, frame)
         self.series.add(time, columns)
 
-    def _lower(self, time: float, margins: Margins) -> None:
-        """Lower the minimum of each barrier to that of a frame."""
-        for rows in filter(len, margins.barriers):
-            at = int(rows.value.argmin()) if rows.barrier in SOLID else rows.closest
-            place = (int(rows.node[at]), int(rows.obstacle[at]), time)
-            found = MinimumMargin(rows.barrier, rows.minimum_clearance, rows.minimum, *place)
-            held = self._minimum.get(rows.barrier, found)
-            lower = found if found.promised < held.promised else held
-            value, clearance = min(found.value, held.value), min(found.clearance, held.clearance)
-            self._minimum[rows.barrier] = replace(lower, value=value, clearance=clearance)
+    def _lower_minimum(self, time: float, rows: BarrierMargins) -> None:
+        """Lower the minimum of a barrier to that of a frame."""
+        at = int(rows.value.argmin()) if rows.barrier in SOLID else rows.closest
+        place = (int(rows.node[at]), int(rows.obstacle[at]), time)
+        new = MinimumMargin(rows.barrier, rows.minimum_clearance, rows.minimum, *place)
+        old = self._minimum.get(rows.barrier, new)
+        lower = new if new.promised < old.promised else old
+        value, clearance = min(new.value, old.value), min(new.clearance, old.clearance)
+        self._minimum[rows.barrier] = replace(lower, value=value, clearance=clearance)
 
-    def _take_disturbances(self, time: float, frame: FrameResult) -> None:
+    def _add_disturbance(self, time: float, frame: FrameResult) -> None:
         """Add the strongest disturbance of a frame to the event that it belongs to, or as a new one."""
-        found = frame.estimate.disturbances if frame.estimate is not None else ()
-        strongest = max(found, key=lambda each: each.significance, default=None)
+        disturbances = frame.estimate.disturbances if frame.estimate is not None else ()
+        strongest = max(disturbances, key=attrgetter("significance"), default=None)
         before, self._disturbed_since = self._disturbed_since, strongest.since if strongest else math.nan
         if strongest is None:
             return
-        (x, y), (along_x, along_y) = strongest.position.tolist(), strongest.direction.tolist()
-        event = DisturbanceEvent(
-            begin_s=time - (frame.stamp * 1e-9 - strongest.since),
-            end_s=time,
-            arc_length_m=strongest.arc_length,
-            extent_m=strongest.extent,
-            x_m=x,
-            y_m=y,
-            direction_rad=math.atan2(along_y, along_x),
-            force_n=strongest.force,
-            significance=strongest.significance,
-        )
+        (x, y), angle = strongest.position.tolist(), math.atan2(*strongest.direction.tolist()[::-1])
+        begin, force = time - (frame.stamp * 1e-9 - strongest.since), (strongest.force, strongest.significance)
+        event = DisturbanceEvent(begin, time, strongest.arc_length, strongest.extent, x, y, angle, *force)
         if strongest.since == before:
-            held = self.disturbances.pop()
-            event = replace(max(held, event, key=lambda each: each.significance), begin_s=held.begin_s, end_s=time)
+            last = self.disturbances.pop()
+            event = replace(max(last, event, key=attrgetter("significance")), begin_s=last.begin_s, end_s=time)
         self.disturbances.append(event)
 
     def _compare(self, time: float, frame: FrameResult) -> dict[str, float]:
@@ -566,7 +541,7 @@ class RunMetrics:
 
     @property
     def target(self) -> str:
-        """What error map and worst frames are compared with: the truth where there is any; empty for nothing."""
+        """Target of error map and worst frames: the truth where there is any; empty for none."""
         return next((target for target in self.targets if len(self.series.known(f"error_{target}"))), "")
 
     def error_map(self, kind: str = "prediction") -> ErrorMap | None:
@@ -584,7 +559,7 @@ class RunMetrics:
 
     @property
     def estimation(self) -> EstimationFigures:
-        """What the run tells of its estimate beside the errors."""
+        """Figures of the run's estimate beside the errors."""
         corrected = int(np.nansum(self.series.column("corrected")))
         consistency, hidden = Consistency.of(self.series), HiddenShares.of(self.series)
         return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances))

@@ -36,11 +36,8 @@ from magnetosuture_thread.thread.margins import SOLID
 SEEN, TRUTH, PREDICTED, ESTIMATED = "#2f7bff", "#1d2833", "#99107f", "#00a3a8"
 INK, FAINT, GOOD, BAD = TRUTH, "#7b8794", "#1f9d55", "#c8102e"
 AGAINST = {"truth": "ground truth", "seen": "the measured centreline"}
-KIND_COLOURS = {
-    "tissue": ("#f0b9b4", "#b8665f"),
-    "instrument": ("#b9c6d2", "#56697a"),
-    "wall": ("#cbbfa9", "#6f624c"),
-}  # of a shape in a scene: face and edge
+# Of a shape in a scene: face and edge.
+KIND_COLOURS = dict(tissue=("#f0b9b4", "#b8665f"), instrument=("#b9c6d2", "#56697a"), wall=("#cbbfa9", "#6f624c"))
 MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", GOOD])  # from 0 to 1 mm
 ERROR_COLOURS = LinearSegmentedColormap.from_list("error", ["#f7f4f8", "#c994c7", PREDICTED, "#2b0726"])
 THREADS: tuple[tuple[str, str, float, float, Any], ...] = (
@@ -160,8 +157,8 @@ def _draw_frame(
     close.plot(*view.to_pixels(ends).T, color=BAD, linewidth=1.8, zorder=4)
     frame_style: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.0, "linestyle": (0, (3, 2))}
     dish.add_patch(Rectangle((middle[0] - half, middle[1] - half), 2.0 * half, 2.0 * half, **frame_style))
-    titles = f"frame at {worst.time:.2f} s, with the greatest error of the prediction", words
-    for axes, share, title in zip((dish, close), (0.25, 0.4), titles, strict=True):
+    whole = f"frame at {worst.time:.2f} s, with the greatest error of the prediction"
+    for axes, share, title in ((dish, 0.25, whole), (close, 0.4, words)):
         draw_scale_bar(axes, view.metres_per_pixel, share)
         axes.set_title(title, fontsize=10, color=INK, loc="left", pad=4)
 
@@ -180,30 +177,31 @@ def _draw_key(figure: Figure, bar: Axes, height: float) -> None:
     scale.ax.tick_params(labelsize=8, colors=INK, length=2, pad=1)
 
 
+def _title(axes: Axes, text: str) -> None:
+    axes.set_title(printable(text), fontsize=9.5, color=INK, loc="left", parse_math=False)
+
+
 def _draw_errors(axes: Axes, metrics: RunMetrics) -> None:
     """Draw the errors of prediction and estimate over time, in the colours of their threads."""
-    kinds = (("recorded_error", FAINT), ("error", PREDICTED), ("estimate_error", ESTIMATED))
-    for prefix, colour in kinds:
+    for prefix, colour in (("recorded_error", FAINT), ("error", PREDICTED), ("estimate_error", ESTIMATED)):
         for target, dashes in (("truth", "solid"), ("seen", (0, (1, 1)))):
             times, errors = with_gaps(metrics.series.times, metrics.series.column(f"{prefix}_{target}"))
             axes.plot(times, errors, color=colour, linewidth=1.3, linestyle=dashes)
     observed, tracked = metrics.observed.times, metrics.observed.column("tracked")
     grey: dict[str, Any] = {"color": FAINT, "alpha": 0.25, "linewidth": 0.0, "step": "post"}
     axes.fill_between(observed, 0.0, 1.0, tracked == 0.0, transform=axes.get_xaxis_transform(), **grey)
-    title = (
-        f"mean distance of the nodes [% of the length]; solid: from {AGAINST['truth']}, dotted: from {AGAINST['seen']}"
-    )
+    lines = f"solid: from {AGAINST['truth']}, dotted: from {AGAINST['seen']}"
+    title = f"mean distance of the nodes [% of the length]; {lines}"
     if len(metrics.series.known("recorded_error_truth")) or len(metrics.series.known("recorded_error_seen")):
         title += "; grey lines: of the recorded prediction"
-    axes.set_title(title, fontsize=9.5, color=INK, loc="left")
+    _title(axes, title)
     axes.set_ylim(bottom=0.0)
 
 
 def _draw_along(axes: Axes, bar: Axes, metrics: RunMetrics) -> None:
     """Draw the error of the prediction along the thread over time."""
-    against = AGAINST.get(metrics.target, "nothing that is known")
-    title = f"distance of the prediction from {against} [% of the length], by arc length from the needle's tail [mm]"
-    axes.set_title(title, fontsize=9.5, color=INK, loc="left")
+    distance = f"distance of the prediction from {AGAINST.get(metrics.target, 'nothing that is known')}"
+    _title(axes, f"{distance} [% of the length], by arc length from the needle's tail [mm]")
     errors = metrics.error_map()
     grid = errors.grid() if errors is not None else None
     if grid is None or grid[2].shape[1] < 2:
@@ -220,8 +218,7 @@ def _draw_margins(axes: Axes, metrics: RunMetrics) -> None:
     minima = [
         f"{name.replace('_', ' ')} {micrometres(least.promised)}" for name, least in metrics.minimum_margins.items()
     ]
-    title = "margins [mm], chords between nodes too; least of nodes: " + (", ".join(minima) or "not known")
-    axes.set_title(printable(title), fontsize=9.5, color=INK, loc="left", parse_math=False)
+    _title(axes, "margins [mm], chords between nodes too; least of nodes: " + (", ".join(minima) or "not known"))
     added = [name for name in metrics.minimum_margins if name not in BUILT_IN]
     for name, colour in zip((*SOLID, *added), itertools.cycle((GOOD, "#56697a", "#f28c28", SEEN)), strict=False):
         times, margins = with_gaps(metrics.series.times, 1e3 * metrics.series.column(f"{MARGIN}{name}"))
@@ -296,7 +293,7 @@ def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
 
 
 def tidy(axes: Axes) -> None:
-    """Give a plot the look of all of ours."""
+    """Draw grid, ticks and frame of a plot as in all of ours."""
     axes.grid(True, color="#e4e8ec", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=8.5, colors=INK, length=3)

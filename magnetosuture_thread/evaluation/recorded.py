@@ -18,18 +18,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.reading import (
-    plane_point,
-    pose_deviation,
-    read_force,
-    read_observation,
-    read_path,
-    read_pose,
-    stamp_of,
-)
+from magnetosuture_thread.bags.reading import parse_scene_message, stamp_of
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.bags.storage import SALVAGED_NOTE
 from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
@@ -43,7 +35,6 @@ from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError, InvalidInputError, MagnetosutureError
-from magnetosuture_thread.settings.interface import Channel
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import lens_of
@@ -52,15 +43,10 @@ from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the setup's thread; a measured one beyond is not of this setup
-# Why frames and poses are refused, as it is counted.
-NOT_FOUND, NOT_NEWER = "no needle for sure", "a stamp not newer than the last"
+NOT_FOUND, NOT_NEWER = "no needle for sure", "a stamp not newer than the last"  # why frames and poses are refused
 DEFAULT_SETUP = "petri_35mm_polyamide"
 SETUP_NOTE = "scenario"  # of a bag, which holds the setup's text
 CHANGING = (interface.SCENE, interface.MATERIAL)  # channels on which a bag records changes of scene and thread
-_TRUE, _SEEN = interface.GROUND_TRUTH_THREAD.recorded, interface.MEASURED_THREAD.recorded
-_OBSERVED, _PULL = interface.THREAD_OBSERVATION.recorded, interface.GROUND_TRUTH_PULL.recorded
-_PREDICTED = interface.PREDICTED_THREAD.recorded
 
 
 def read_image(record: RecordedMessage) -> NDArray[np.uint8]:
@@ -84,11 +70,11 @@ def _read_prediction(record: RecordedMessage) -> Points:
 
 # Part of an observation that each topic gives, how it is read, and what stands for one that is not valid.
 _PARTS: dict[str, tuple[str, Callable[[RecordedMessage], Any], Any]] = {
-    _TRUE: ("ground_truth", read_path, np.empty((0, 2))),
-    _SEEN: ("measured", read_path, np.empty((0, 2))),
-    _OBSERVED: ("observation", read_observation, ThreadObservation()),
-    _PULL: ("true_pull", read_force, np.empty(0)),
-    _PREDICTED: ("recorded", _read_prediction, np.empty((0, 2))),
+    interface.GROUND_TRUTH_THREAD.recorded: ("ground_truth", reading.read_path, np.empty((0, 2))),
+    interface.MEASURED_THREAD.recorded: ("measured", reading.read_path, np.empty((0, 2))),
+    interface.THREAD_OBSERVATION.recorded: ("observation", reading.read_observation, ThreadObservation()),
+    interface.GROUND_TRUTH_PULL.recorded: ("true_pull", reading.read_force, np.empty(0)),
+    interface.PREDICTED_THREAD.recorded: ("recorded", _read_prediction, np.empty((0, 2))),
 }
 
 
@@ -153,14 +139,14 @@ class ObservationReader:
         self._scene, self._length = bag.setup.scene, bag.setup.model.thread_length
         self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
-        channels: tuple[Channel, ...] = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
+        channels = [interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, interface.PREDICTED_THREAD, *CHANGING]
         if bag.recording.camera is not None and self.source == "camera":
             warm_up()
             self._tracker = TrackerSession(bag.setup.vision, bag.setup.scene)
-            channels = (bag.recording.camera, interface.CAMERA_INFO, interface.NEEDLE_TIP)
-        compared = (interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, interface.PREDICTED_THREAD)
-        possible = (*compared, *CHANGING, *channels)
-        self._channels = [channel for channel in possible if bag.recording.counts.get(channel.recorded)]
+            channels += bag.recording.camera, interface.CAMERA_INFO, interface.NEEDLE_TIP
+        else:
+            channels += interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION
+        self._channels = [channel for channel in channels if bag.recording.counts.get(channel.recorded)]
         # What belongs to a frame, by topic and stamp.
         self._parts: dict[str, dict[int, Any]] = {c.recorded: {} for c in self._channels if c.recorded in _PARTS}
 
@@ -181,8 +167,8 @@ class ObservationReader:
         if 2 * self._odd <= self._measured:
             return ""
         return (
-            f"{self._odd} of {self._measured} measured threads are longer than {MAX_LENGTH_RATIO:g} times or "
-            f"shorter than {MIN_LENGTH_RATIO:g} times the setup's {self._length:g} m: is it another thread?"
+            f"{self._odd} of {self._measured} measured threads are longer than 3 times or "
+            f"shorter than 0.2 times the setup's {self._length:g} m: is it another thread?"
         )
 
     def events(self) -> Iterator[Observation | TrackedFrame | RecordedMessage]:
@@ -202,30 +188,36 @@ class ObservationReader:
             if record.time >= reported:  # a thousand times at the most: showing it takes longer than a step
                 self._progress(min(1.0, (record.time - begin) * 1e-9 / duration))
                 reported = record.time + max(round(duration * 1e6), 1)
-            if record.topic in self._parts:
+            topic = record.topic
+            if topic in self._parts:
                 self._keep(record)
-                if record.topic in (_SEEN, _OBSERVED):
+                if topic in (interface.MEASURED_THREAD.recorded, interface.THREAD_OBSERVATION.recorded):
                     yield record
-            elif record.topic in (interface.SCENE.recorded, interface.MATERIAL.recorded):
+            elif topic in (channel.recorded for channel in CHANGING):
                 self._follow(record)
                 waiting.append(record)
             elif self._tracker is None:
                 yield record
                 waiting.append(self._pose(record))
-            elif record.topic == interface.CAMERA_INFO.recorded:
-                self._set_lens(record, self._tracker)
-            elif record.topic == interface.NEEDLE_TIP.recorded:
-                self._set_tip(record, self._tracker)
+            elif topic == interface.CAMERA_INFO.recorded:
+                lens = None
+                with self.counting(topic):
+                    lens = lens_of(record.decode())
+                self._tracker.set_lens(lens)
+            elif topic == interface.NEEDLE_TIP.recorded:
+                with self.counting(topic):
+                    stamp = min(stamp_of(record), record.time) or record.time
+                    self._tracker.point_at_tip(reading.plane_point(record.decode(), topic), stamp * 1e-9)
             else:
-                frame, seconds = self._track(record, self._tracker)
+                frame, observation = self._track(record, self._tracker)
                 yield frame
-                waiting.append(self._measured_observation(frame, seconds))
-            while waiting and (len(waiting) > MAX_WAITING_POSES or self._complete(waiting[0])):
+                waiting.append(observation)
+            while waiting and (len(waiting) > MAX_WAITING_POSES or self._is_complete(waiting[0])):
                 yield self._with_parts(waiting.popleft())
         while waiting:
             yield self._with_parts(waiting.popleft())
 
-    def _complete(self, head: Observation | RecordedMessage) -> bool:
+    def _is_complete(self, head: Observation | RecordedMessage) -> bool:
         """Return whether all that belongs to an observation has come."""
         return isinstance(head, RecordedMessage) or all(head.stamp in known for known in self._parts.values())
 
@@ -248,37 +240,21 @@ class ObservationReader:
             return  # counted and reported where the model takes it
         self._scene = scene
 
-    def _set_lens(self, record: RecordedMessage, tracker: TrackerSession) -> None:
-        """Undo the distortion of a recorded lens from here on, as `vision_tracker` does."""
-        lens = None
-        with self.counting(record.topic):
-            lens = lens_of(record.decode())
-        tracker.set_lens(lens)
-
-    def _set_tip(self, record: RecordedMessage, tracker: TrackerSession) -> None:
-        """Set which end of the needle is its tip, as `vision_tracker` does."""
-        with self.counting(record.topic):
-            stamp = min(stamp_of(record), record.time) or record.time
-            tracker.point_at_tip(plane_point(record.decode(), record.topic), stamp * 1e-9)
-
     def _keep(self, record: RecordedMessage) -> None:
         """Keep what belongs to a frame; nothing where it is not valid."""
         topic, known = record.topic, self._parts[record.topic]
-        _, read, part = _PARTS[topic]
+        name, read, part = _PARTS[topic]
         try:
             part = read(record)
         except InvalidInputError as error:
             self.refused[f"{topic}: {error}"] += 1
         known[stamp_of(record)] = part
-        if topic == _OBSERVED:
-            for piece in part.pieces:
-                self._check_place(topic, piece.points)
-        if topic == _SEEN:
-            self._check_place(topic, part)
-            if len(part) and np.isfinite(part).all():
-                length = float(arc_lengths(part)[-1]) / self._length
-                self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
-                self._measured += 1
+        if name in ("observation", "measured"):
+            for points in [part] if name == "measured" else [piece.points for piece in part.pieces]:
+                self._check_place(topic, points)
+        if name == "measured" and len(part) and np.isfinite(part).all():
+            self._odd += not 0.2 <= float(arc_lengths(part)[-1]) / self._length <= 3.0  # then it is not of this setup
+            self._measured += 1
         if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
             del known[next(iter(known))]
 
@@ -287,44 +263,40 @@ class ObservationReader:
         self.count += 1
         stamp = stamp_of(record)
         try:
-            tail, heading, deviation = read_pose(record)
+            tail, heading, deviation = reading.read_pose(record)
         except InvalidInputError as error:
-            self.refused["a pose that is none"] += 1
+            self.refused["a pose that is not valid"] += 1
             return Observation(stamp, reason=str(error))
         self._check_place(record.topic, tail)
         self.found += 1
         return Observation(stamp, tail, heading, deviation=deviation)
 
-    def _track(self, record: RecordedMessage, tracker: TrackerSession) -> tuple[TrackedFrame, float]:
-        """Track a camera frame; return what is measured, and how long that took [s]."""
-        stamp = stamp_of(record)
+    def _track(self, record: RecordedMessage, tracker: TrackerSession) -> tuple[TrackedFrame, Observation]:
+        """Track a camera frame; return what is measured, and the observation as `thread_model` would get it."""
+        self.count += 1
+        stamp, began = stamp_of(record), time.perf_counter()
         try:
             image = read_image(record)
         except InvalidInputError as error:
-            began = time.perf_counter()
             measurement = tracker.on_broken(error)
         else:
             began = time.perf_counter()
             measurement = tracker.on_image(stamp * 1e-9, image)
-        return TrackedFrame(stamp, measurement), time.perf_counter() - began
-
-    def _measured_observation(self, frame: TrackedFrame, seconds: float) -> Observation:
-        """Return what a camera frame says, as `thread_model` would get it."""
-        self.count += 1
-        measurement, track = frame.measurement, frame.measurement.track
+        seconds, track = time.perf_counter() - began, measurement.track
+        frame = TrackedFrame(stamp, measurement)
         if not measurement.tracked:
             reason = NOT_FOUND if measurement.problem is None else str(measurement.problem)
             self.refused[NOT_NEWER if reason.startswith("image.stamp") else reason] += 1
-            return Observation(frame.stamp, reason=track.reason, processing=seconds)
+            return frame, Observation(stamp, reason=track.reason, processing=seconds)
         self.found += 1
-        return Observation(
-            frame.stamp,
+        return frame, Observation(
+            stamp,
             np.asarray(track.tail),
             round_trip_heading(track.heading, interface.NEEDLE_POSE.name),
             measurement.centreline,
             processing=seconds,
             observation=track.observation,
-            deviation=pose_deviation(np.diag(track.covariance)),
+            deviation=reading.pose_deviation(np.diag(track.covariance)),
         )
 
     def _check_place(self, topic: str, points: Points) -> None:
@@ -366,7 +338,12 @@ def predictions(reader: ObservationReader, settings: ThreadModelSettings, scene:
         yield event
         if isinstance(event, RecordedMessage) and event.topic in (channel.recorded for channel in CHANGING):
             with reader.counting(event.topic):
-                _change(session, event)
+                message = event.decode()
+                if event.topic == interface.SCENE.recorded:
+                    session.change(session.settings, parse_scene_message(message))
+                else:
+                    mapping = {**to_mapping(session.settings), **parse_material(message)}
+                    session.change(from_mapping(ThreadModelSettings, mapping), session.scene)
         if not isinstance(event, Observation) or not event.found:
             continue
         results: Iterator[PredictionResult] = iter(())
@@ -378,10 +355,8 @@ def predictions(reader: ObservationReader, settings: ThreadModelSettings, scene:
         for result in results:
             yield step(waiting.get(result.stamp, event), result, time.perf_counter() - began)
             began = time.perf_counter()
-        began = time.perf_counter()
-        predicted = session.predict(
-            event.stamp, NeedlePose(event.stamp * 1e-9, event.tail, event.heading, event.deviation)
-        )
+        began, pose = time.perf_counter(), NeedlePose(event.stamp * 1e-9, event.tail, event.heading, event.deviation)
+        predicted = session.predict(event.stamp, pose)
         seconds = time.perf_counter() - began
         yield step(event, session.estimate(predicted), seconds)
         for late in session.late_estimates():  # of observations that are refused: all others come with their poses
@@ -390,18 +365,8 @@ def predictions(reader: ObservationReader, settings: ThreadModelSettings, scene:
             del waiting[next(iter(waiting))]
 
 
-def _change(session: ThreadSession, record: RecordedMessage) -> None:
-    """Change scene or thread as a bag says."""
-    settings, scene = session.settings, session.scene
-    if record.topic == interface.SCENE.recorded:
-        scene = parse_scene_message(record.decode())
-    else:
-        settings = from_mapping(ThreadModelSettings, {**to_mapping(settings), **parse_material(record.decode())})
-    session.change(settings, scene)
-
-
 class BagSelection(TypedDict, total=False):
-    """What of a bag is read, and with which setup.
+    """Part of a bag that is read, and the setup.
 
     Attributes:
         setup_name: name or path of the setup; the one that the bag names if empty.
@@ -446,12 +411,9 @@ class BagInput:
     @property
     def notes(self) -> dict[str, str]:
         """Return the notes of a bag made from this one."""
-        own = (
-            {SALVAGED_NOTE: self.recording.salvaged_without_checksum}
-            if self.recording.salvaged_without_checksum
-            else {}
-        )
-        return {**self.recording.notes, **own, "setup": self.setup.name, "replayed": str(self.recording.path)}
+        reason = self.recording.salvaged_without_checksum
+        notes = {**self.recording.notes, **({SALVAGED_NOTE: reason} if reason else {})}
+        return {**notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
 
     def observations(self, progress: Progress = lambda share: None) -> ObservationReader:
         """Return the observations; `progress` is called with the share done, 0 to 1."""
@@ -475,15 +437,11 @@ def chosen_source(recording: Recording, source: str) -> str:
     Raises:
         BagError: the bag does not hold what was asked for.
     """
-    for name, is_there in (
-        ("camera", recording.camera is not None),
-        ("poses", recording.counts.get(interface.NEEDLE_POSE.recorded)),
-    ):
-        if is_there and source in ("auto", name):
-            return name
-    for channel in (*interface.CAMERA.values(), interface.NEEDLE_POSE):
-        if channel.recorded in recording.unfit:
-            raise BagError(recording.path, recording.unfit[channel.recorded])
+    if recording.camera is not None and source != "poses":
+        return "camera"
+    if recording.counts.get(interface.NEEDLE_POSE.recorded) and source != "camera":
+        return "poses"
+    recording.refuse_unfit(*interface.CAMERA.values(), interface.NEEDLE_POSE)
     recording.require(interface.NEEDLE_POSE if source == "poses" else interface.COMPRESSED_IMAGE)
     raise BagError(recording.path, "holds camera frames on a topic that is not theirs")  # require says all else
 
@@ -503,9 +461,8 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     """
     log(f"checking {path}")
     start, duration = selection.get("start", 0.0), selection.get("duration")
-    recording = Recording(
-        Bag(path, remap=selection.get("remap")), dish_frame=selection.get("frame", interface.DISH_FRAME)
-    )
+    bag = Bag(path, remap=selection.get("remap"))
+    recording = Recording(bag, dish_frame=selection.get("frame", interface.DISH_FRAME))
     if recording.damage is not None:
         log(f"the bag is damaged, what is intact is played: {recording.damage}")
     if recording.salvaged_without_checksum:
@@ -517,14 +474,8 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     source = chosen_source(recording, selection.get("source", "auto"))
-    for channel in (
-        interface.MEASURED_THREAD,
-        interface.NEEDLE_COMMAND,
-        interface.GROUND_TRUTH_THREAD,
-        interface.GROUND_TRUTH_PULL,
-    ):
-        if channel.recorded in recording.unfit:
-            raise BagError(path, recording.unfit[channel.recorded])
+    recording.refuse_unfit(interface.MEASURED_THREAD, interface.NEEDLE_COMMAND)
+    recording.refuse_unfit(interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL)
     left = recording.duration - start
     with TemporaryDirectory() as spare:
         setup = _setup_of(recording, selection.get("setup_name", ""), Path(spare), _scene_at(recording, start), log)
@@ -535,17 +486,17 @@ def _scene_at(recording: Recording, start: float) -> Scene | None:
     """Return the scene in force at a time into a bag [s], else the first one; None if the bag has none.
 
     Raises:
-        BagError: what it tells is no scene.
+        BagError: a message is not a valid scene.
     """
-    found: Scene | None = None
+    scene: Scene | None = None
     for record in recording.records([interface.SCENE]) if recording.counts.get(interface.SCENE.recorded) else ():
-        if found is not None and record.time > recording.start + round(start * 1e9):
+        if scene is not None and record.time > recording.start + round(start * 1e9):
             break
         try:
-            found = parse_scene_message(record.decode())
+            scene = parse_scene_message(record.decode())
         except InvalidInputError as error:
             raise BagError(recording.path, str(error)) from None
-    return found
+    return scene
 
 
 def _setup_of(recording: Recording, name: str, folder: Path, scene: Scene | None, log: Log) -> Setup:
@@ -586,9 +537,9 @@ def setup_of_notes(notes: Mapping[str, str], folder: Path, scene: Scene | None =
     Raises:
         ConfigurationError: it cannot be used.
     """
-    named = notes.get("setup", "")
-    if not (text := notes.get(SETUP_NOTE, "")):
-        return read_setup(named, scene)
-    path = folder / f"{named or 'scenario'}.yaml"
+    name, text = notes.get("setup", ""), notes.get(SETUP_NOTE, "")
+    if not text:
+        return read_setup(name, scene)
+    path = folder / f"{name or 'scenario'}.yaml"
     path.write_text(text, encoding="utf-8")
     return read_setup(str(path), scene)

@@ -7,7 +7,8 @@ import math
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation.frames import FrameResult
-from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics, node_errors
+from magnetosuture_thread.evaluation.metrics import RunMetrics, node_errors
 from magnetosuture_thread.evaluation.workers import Progress
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
@@ -62,14 +63,13 @@ class ReferenceTrajectory:
 
     def at(self, time: float) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
         """Return tail, heading and thread at a time, linear between the samples."""
-        last = len(self.times) - 1
-        index = int(np.clip(np.searchsorted(self.times, time) - 1, 0, last - 1))
+        index = int(np.clip(np.searchsorted(self.times, time) - 1, 0, len(self.times) - 2))
         part = (time - self.times[index]) / (self.times[index + 1] - self.times[index])
-
-        def between(values: NDArray[np.float64]) -> NDArray[np.float64]:
-            return np.asarray(values[index] + part * (values[index + 1] - values[index]))
-
-        return between(self.tails), float(between(self.headings)), between(self.threads)
+        tail, heading, thread = (
+            np.asarray(values[index] + part * (values[index + 1] - values[index]))
+            for values in (self.tails, self.headings, self.threads)
+        )
+        return tail, float(heading), thread
 
 
 def read_reference(path: Path) -> ReferenceTrajectory:
@@ -96,11 +96,10 @@ def read_reference(path: Path) -> ReferenceTrajectory:
     except MALFORMED as error:
         problem = " ".join(str(error).split())
         raise BagError(path, f"is no reference trajectory with the keys t, pose, X, meta: {problem}") from None
-    count = times.size
-    is_shaped = times.shape == (count,) and poses.shape == (count, 3) and threads.ndim == 3
-    if count < 2 or not is_shaped or threads.shape[::2] != (count, 2):
-        shapes = f"t {times.shape}, pose {poses.shape}, X {threads.shape}"
-        raise BagError(path, f"has shapes {shapes}; expected t (T,), pose (T, 3), X (T, m, 2)")
+    count, shapes = times.size, (times.shape, poses.shape, threads.shape)
+    if count < 2 or shapes != ((count,), (count, 3), (count, *threads.shape[1:2], 2)):
+        problem = f"has shapes t {times.shape}, pose {poses.shape}, X {threads.shape}"
+        raise BagError(path, f"{problem}; expected t (T,), pose (T, 3), X (T, m, 2)")
     finite = all(np.all(np.isfinite(values)) for values in (times, poses, threads))
     if not (finite and np.all(np.diff(times) > 0.0)):
         raise BagError(path, "has times that do not increase, or values that are not finite")
@@ -110,7 +109,7 @@ def read_reference(path: Path) -> ReferenceTrajectory:
 
 @dataclass(frozen=True)
 class CaseScore:
-    """How a formulation did on one trajectory.
+    """Scores of a formulation on one trajectory.
 
     Attributes:
         name: of the case.
@@ -161,13 +160,8 @@ class Evaluation:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what goes into JSON."""
-        return {
-            "formulation": self.formulation,
-            "solver": self.solver,
-            "cases": [asdict(case) for case in self.cases],
-            "mean_error_percent": self.mean_error_percent,
-            "worst_error_percent": self.worst_error_percent,
-        }
+        errors = {"mean_error_percent": self.mean_error_percent, "worst_error_percent": self.worst_error_percent}
+        return {**asdict(self), "cases": [asdict(case) for case in self.cases], **errors}
 
 
 @dataclass(frozen=True)
@@ -193,9 +187,8 @@ class CaseResult:
         metrics = RunMetrics(float(self.reference.metadata["material"]["L_m"]), int(stamps[0]), ("truth",))
         for stamp, nodes, thread in zip(stamps.tolist(), self.vertices, self.reference.threads, strict=True):
             lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
-            strain = float(np.abs(lengths * segments / metrics.length - 1.0).max())
-            obstacles = self.reference.discs
-            metrics.add(FrameResult(stamp, vertices=nodes, ground_truth=thread, strain=strain, obstacles=obstacles))
+            strain, discs = float(np.abs(lengths * segments / metrics.length - 1.0).max()), self.reference.discs
+            metrics.add(FrameResult(stamp, vertices=nodes, ground_truth=thread, strain=strain, obstacles=discs))
         return metrics
 
 
@@ -239,17 +232,13 @@ def score(
 
     def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
         thread, paper = reference_thread(reference, path, segments)
+        workspace = Workspace(reference.discs, 3e-3)  # m; within this of an obstacle, depths are looked at
         predictor = ThreadPredictor(
-            thread,
-            Workspace(reference.discs, 3e-3),  # m; within this of an obstacle, depths are looked at
-            formulation=formulation,
-            solver=solver,
-            paper=paper,
-            residual_tolerance=1e-6,
+            thread, workspace, formulation=formulation, solver=solver, paper=paper, residual_tolerance=1e-6
         )
         predictor.warm_up()
         headings = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
-        poses = [NeedlePose(*each) for each in zip(reference.times, reference.tails, headings, strict=True)]
+        poses = [NeedlePose(*pose) for pose in zip(reference.times, reference.tails, headings, strict=True)]
         initial = resampled(reference.threads[0], thread.segments)
         predictor.start_at(poses[0], initial)
 
@@ -260,40 +249,30 @@ def score(
 
         return run_case(reference, initial, thread.length, thread.diameter, step, share)
 
-    return Evaluation(formulation, solver, score_each(paths, score_case, progress, keep))
+    return Evaluation(formulation, solver, _score_each(paths, score_case, progress, keep))
 
 
-def score_each(
+def _score_each(
     paths: Sequence[Path],
-    one: Callable[[ReferenceTrajectory, Path, Progress], CaseResult],
+    score_case: Callable[[ReferenceTrajectory, Path, Progress], CaseResult],
     progress: Progress,
     keep: Callable[[CaseResult], None],
 ) -> tuple[CaseScore, ...]:
-    """Score trajectories one after another.
-
-    Args:
-        paths: the trajectories.
-        one: scores one of them; its last argument is called with the share done.
-        progress: called with the share of all that is done.
-        keep: called with each case's result.
-
-    Raises:
-        BagError: a file is no reference trajectory.
-    """
+    """Score trajectories one after another; progress is called with the share of all that is done."""
     scores = []
     for index, path in enumerate(paths):
 
-        def share(part: float, index: int = index) -> None:
-            progress((index + part) / len(paths))
+        def share(part: float, done: int = index) -> None:
+            progress((done + part) / len(paths))
 
-        result = one(read_reference(path), path, share)
+        result = score_case(read_reference(path), path, share)
         scores.append(result.score)
         keep(result)
     return tuple(scores)
 
 
 class StepFigures(NamedTuple):
-    """What one step of a simulated or predicted thread gave.
+    """Figures of one step of a simulated or predicted thread.
 
     Attributes:
         vertices: of the thread, shape (n + 1, 2) [m].
@@ -328,31 +307,30 @@ def run_case(
 
     Source: reference set, "How a prediction is scored". Deviation: none.
     """
-    count, steps, took = len(reference.times), [], []
+    count, steps, times = len(reference.times), [], []
     for k in range(1, count):
         began = time.perf_counter()
         steps.append(step(k))
-        took.append(time.perf_counter() - began)
+        times.append(time.perf_counter() - began)
         if k % 50 == 0:
             progress(k / count)
-    vertices = np.array([initial, *(each.vertices for each in steps)])
+    vertices = np.array([initial, *(figures.vertices for figures in steps)])
     # The needle's own way is given, so only the thread's nodes can be blamed.
     nodes = vertices[1:, 1:].reshape(-1, 2)
     gaps = [float(disc.signed_distance(nodes)[0].min()) - 0.5 * diameter for disc in reference.discs]
     truth = np.stack([resampled(curve, len(initial) - 1) for curve in reference.threads])
     error = node_errors(vertices, truth[:, 1:], length).mean(axis=1)
-    times = Percentiles.of(took)
-    assert times is not None  # a trajectory has two samples or more
+    median, p99 = np.percentile(times, (50, 99)).tolist()
     score = CaseScore(
         name=reference.name,
         mean_error_percent=float(error.mean()),
         max_error_percent=float(error.max()),
-        max_stretch=max(each.strain for each in steps),
+        max_stretch=max(figures.strain for figures in steps),
         max_penetration_m=max(0.0, -min(gaps, default=0.0)),
-        step_median_s=times.median,
-        step_p99_s=times.p99,
-        max_residual=max(each.residual for each in steps),
-        fallbacks=sum(each.fallbacks for each in steps),
+        step_median_s=median,
+        step_p99_s=p99,
+        max_residual=max(figures.residual for figures in steps),
+        fallbacks=sum(figures.fallbacks for figures in steps),
     )
     return CaseResult(reference, vertices, error, score)
 
@@ -402,25 +380,28 @@ def score_rig(
 
         return run_case(trajectory, rig.thread, length, thread.diameter, step, share)
 
-    return Evaluation("rig", "newton", score_each(paths, score_case, progress, keep))
+    return Evaluation("rig", "newton", _score_each(paths, score_case, progress, keep))
+
+
+@contextmanager
+def _thread_of(path: Path) -> Iterator[None]:
+    """Refuse metadata that does not describe a thread."""
+    try:
+        yield
+    except (*MALFORMED, ConfigurationError) as error:
+        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
 
 
 def _rig_thread(trajectory: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
-    """Return the thread that a trajectory's metadata describes.
-
-    Raises:
-        BagError: the metadata lacks something, or holds what is none.
-    """
+    """Return the rig's thread that a trajectory's metadata describes, or refuse it."""
     names = ("L_m", "EI_Nm2", "EA_N", "zeta_perp_Pa_s", "zeta_par_Pa_s", "diameter_m")
-    try:
-        material = trajectory.metadata["material"]
-        length, bending, stretching, across, along, diameter = values = [float(material[name]) for name in names]
-        attachment = {"pinned": NeedleJoint.PINNED, "clamped": NeedleJoint.CLAMPED}[trajectory.metadata["boundary"]]
-    except MALFORMED as error:
-        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
+    with _thread_of(path):
+        values = [float(trajectory.metadata["material"][name]) for name in names]
+        joint = NeedleJoint(trajectory.metadata["boundary"])
     if not all(math.isfinite(value) and value > 0.0 for value in values):
         raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
-    return ThreadProperties(length, segments, bending, stretching, across, along, attachment, diameter=diameter)
+    length, bending, stretching, across, along, diameter = values
+    return ThreadProperties(length, segments, bending, stretching, across, along, joint, diameter)
 
 
 def reference_thread(
@@ -431,12 +412,11 @@ def reference_thread(
     Those are of silk where the kind says silk, else of polyamide: W_stiff is tuned for these two only.
 
     Raises:
-        BagError: the metadata lacks something, or holds what is none.
+        BagError: the metadata lacks something, or holds something that is not valid.
     """
-    try:
+    with _thread_of(path):
         material = reference.metadata["material"]
         kind = str(material["kind"])
-        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
         thread = Thread(
             material=kind,
             length=float(material["L_m"]),
@@ -444,10 +424,8 @@ def reference_thread(
             diameter=float(material["diameter_m"]),
             bending_stiffness=float(material["EI_Nm2"]),
             medium=Medium(float(material["zeta_perp_Pa_s"]), float(material["zeta_par_Pa_s"])),
-            attachment=attachment,
+            attachment=Attachment(reference.metadata["boundary"]),
         )
-    except (*MALFORMED, ConfigurationError) as error:
-        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
     if not thread.bending_stiffness * thread.medium.drag_along > 0.0:
         raise BagError(path, "has a thread whose stiffness or drag are not positive")
     family = "silk_6_0" if "silk" in kind else "polyamide_7_0"

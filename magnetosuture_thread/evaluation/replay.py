@@ -6,33 +6,23 @@ import json
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from magnetosuture_thread.bags import packing
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.reader import RecordedMessage
-from magnetosuture_thread.bags.reading import stamp_of
+from magnetosuture_thread.bags.reading import nanoseconds, stamp_of
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import WAITING
-from magnetosuture_thread.evaluation.frames import FrameResult, Observation
-from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary, figures_of
+from magnetosuture_thread.evaluation import recorded
+from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import TARGETS, Percentiles, RunMetrics, SensorSilence, finite_or_none
-from magnetosuture_thread.evaluation.recorded import (
-    NOT_FOUND,
-    NOT_NEWER,
-    BagInput,
-    BagSelection,
-    Event,
-    Step,
-    TrackedFrame,
-    open_bag,
-    predictions,
-    read_image,
-)
+from magnetosuture_thread.evaluation.recorded import BagInput, Event, Step, TrackedFrame
+from magnetosuture_thread.evaluation.tables import STAGES, ReplaySummary, figures_of
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError, InvalidInputError
@@ -43,12 +33,6 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from magnetosuture_thread.evaluation.plots import Photo
-
-LATENT = {
-    interface.NEEDLE_POSE: "frame to needle pose",
-    interface.PREDICTED_THREAD: "frame to prediction",
-    interface.CURRENTS: "command to currents",
-}  # what a latency is measured to, by the channel that answers
 
 
 class MeasuredRun(NamedTuple):
@@ -93,7 +77,7 @@ def measure_run(
     reader = bag.observations(progress)
     metrics, refused = RunMetrics(model.thread_length, bag.recording.start, targets), Counter[str]()
     began = time.perf_counter()  # kernels are loaded
-    for event in predictions(reader, model, bag.setup.scene):
+    for event in recorded.predictions(reader, model, bag.setup.scene):
         write(event)
         if isinstance(event, Observation):
             metrics.observe(event)
@@ -103,7 +87,8 @@ def measure_run(
     speed = (bag.duration - silence.total) / (time.perf_counter() - began)
     refused += reader.refused + bag.recording.refused
     if not len(metrics.series):
-        reasons = Counter(metrics.reasons) + Counter({why: n for why, n in refused.items() if why != NOT_FOUND})
+        others = Counter({why: count for why, count in refused.items() if why != recorded.NOT_FOUND})
+        reasons = Counter(metrics.reasons) + others
         words = "; ".join(f"{count} times {why}" for why, count in reasons.most_common(3)) or WAITING
         things = "frames" if reader.source == "camera" else "poses"
         counts = f"{reader.found} of {reader.count} {things} had a needle"
@@ -115,20 +100,15 @@ def _measure_step(step: Step, metrics: RunMetrics, refused: Counter[str]) -> Non
     """Add a step to the figures of a run, or why there is no prediction to what is refused."""
     result = step.result
     if result.prediction is not None:
-        frame = FrameResult.of(
-            step.observation,
-            result.prediction,
-            result.margins,
-            step.step_time,
-            estimate=result.estimate,
-            estimated=step.settings.is_estimated,
-            obstacles=step.scene.obstacles if step.scene is not None else (),
-        )
+        frame = FrameResult.of(step.observation, result.prediction, result.margins, step.step_time)
+        if step.settings.is_estimated:
+            frame.estimate = EstimatedThread.of(result.estimate, result.prediction)
+        frame.obstacles = step.scene.obstacles if step.scene is not None else ()
         metrics.add(frame)
     problem = result.problem or result.estimate_problem
     if isinstance(problem, InvalidInputError):
         is_late = problem.field == "needle pose stamp"
-        refused[NOT_NEWER if is_late else f"a {problem.field} that cannot be used"] += 1
+        refused[recorded.NOT_NEWER if is_late else f"a {problem.field} that cannot be used"] += 1
     elif problem is not None:
         refused["a program that was not solved"] += 1
 
@@ -139,7 +119,7 @@ def replay_offline(
     *,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[recorded.BagSelection],
 ) -> ReplaySummary:
     """Put a bag through tracker and model without a graph, and evaluate the predictions.
 
@@ -159,7 +139,7 @@ def replay_offline(
         BagError: the bag cannot be used, nothing in it was predicted, or the output exists or cannot be written.
         ConfigurationError: the setup cannot be used.
     """
-    with open_bag(bag_path, log, **selection) as bag, whole_folder(output) as folder:
+    with recorded.open_bag(bag_path, log, **selection) as bag, whole_folder(output) as folder:
         source = "camera frames" if bag.source == "camera" else "recorded poses"
         log(f"predicting by the {source} of {bag.duration:.1f} s")
         with BagWriter(folder / "bag", bag.notes) as writer:
@@ -167,16 +147,8 @@ def replay_offline(
             metrics, refused, remark, silence, speed = measure_run(bag, bag.setup.model, progress=progress, write=write)
         log(f"{speed:.3g} times as fast as it was recorded; evaluating the outputs")
         counts = {"frames": len(metrics.observed), "tracked": metrics.tracked, "commands": 0, "driven": 0}
-        summary = replay_summary(
-            bag,
-            metrics,
-            **counts,
-            latency={},
-            speed=speed,
-            refused=dict(refused.most_common()),
-            silence=silence,
-            remark=remark,
-        )
+        run = {"speed": speed, "refused": dict(refused.most_common()), "silence": silence, "remark": remark}
+        summary = replay_summary(bag, metrics, **counts, latency={}, **run)
         if remark:
             log(remark)
         write_results(folder, bag, metrics, summary, log)
@@ -195,10 +167,9 @@ class _OutputWriter:
         self._writer, self._version = writer, bag.setup.scene.version
         writer.add_topic(interface.SCENE.recorded, interface.SCENE.type_name)
         writer.write(interface.SCENE.recorded, bag.begin, packed_scene(bag.begin, bag.setup.scene))
-        is_camera, counts = bag.source == "camera", bag.recording.counts
-        channels = [interface.TRACKER_STATE] if is_camera else []
-        if is_camera or counts.get(interface.THREAD_OBSERVATION.recorded):
-            channels.append(interface.THREAD_OBSERVATION)
+        is_camera = bag.source == "camera"
+        is_observed = is_camera or bag.recording.counts.get(interface.THREAD_OBSERVATION.recorded)
+        channels = [*[interface.TRACKER_STATE] * is_camera, *[interface.THREAD_OBSERVATION] * bool(is_observed)]
         channels += [interface.NEEDLE_POSE, interface.MEASURED_THREAD]
         channels += [interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS]
         for channel in channels:
@@ -222,13 +193,13 @@ class _OutputWriter:
                     self._write(stamp, packing.pose_outputs(stamp, track.tail, track.heading, track.covariance))
                     self._write(stamp, packing.thread_outputs(stamp, track.observation, measurement.centreline))
                 state = packing.packed_tracker_state(stamp, track)
-                self._writer.write(interface.TRACKER_STATE.recorded, max(stamp, 0), state)
+                self._write(stamp, [(interface.TRACKER_STATE, state)])
             case Step(result=result, settings=settings):
                 self._write(result.stamp, packing.prediction_outputs(result, settings.material))
                 if result.refused is None and not result.late:  # as live: a pose that is refused gets no answer
                     self._write(result.stamp, packing.estimate_outputs(result))
 
-    def _write(self, stamp: int, outputs: packing.Outputs) -> None:
+    def _write(self, stamp: int, outputs: Iterable[tuple[interface.Channel, bytes]]) -> None:
         for channel, data in outputs:
             self._writer.write(channel.recorded, max(stamp, 0), data)
 
@@ -289,8 +260,8 @@ def draw_run(bag: BagInput, metrics: RunMetrics, log: Log) -> bytes:
 
         assert metrics.worst is not None
         photo = find_photo(bag, metrics.worst.frame.stamp)
-        simulated = bag.recording.notes.get("simulated", "")
         title = f"{bag.recording.path.name}, setup {bag.setup.name}"
+        simulated = bag.recording.notes.get("simulated", "")
         return draw_metrics(metrics, title, bag.setup.scene.dish.diameter, photo, simulated)
 
     return picture_or_log(draw, log)
@@ -324,7 +295,7 @@ def find_photo(bag: BagInput, stamp: int) -> Photo | None:
         if view is not None and not is_wanted:
             continue
         try:
-            image = read_image(record)
+            image = recorded.read_image(record)
         except (BagError, InvalidInputError):
             continue
         view = VisionTracker(bag.setup.vision, bag.setup.scene).look(image).view or view
@@ -347,20 +318,22 @@ def recorded_latency(recording: Recording, start: float, duration: float | None)
     Raises:
         BagError: the bag has changed since it was opened.
     """
-    channels = [channel for channel in LATENT if recording.counts.get(channel.recorded)]
-    if not channels or "replayed" in recording.notes:
+    if "replayed" in recording.notes:
         return {}
+    answers = interface.NEEDLE_POSE, interface.PREDICTED_THREAD, interface.CURRENTS
+    channels = [channel for channel in answers if recording.counts.get(channel.recorded)]
     latencies = {channel.recorded: array("d") for channel in channels}
-    latest: dict[str, int] = {}
+    latest = dict.fromkeys(latencies, 0)
     for record in recording.records(channels, start=start, duration=duration):
         stamp = _answered_stamp(record)
-        if stamp > latest.get(record.topic, 0):
+        if stamp > latest[record.topic]:
             latest[record.topic] = stamp
             latencies[record.topic].append((record.time - stamp) * 1e-9)
-    percentiles = {LATENT[channel]: Percentiles.of(latencies[channel.recorded]) for channel in channels}
-    stages = {stage: spread for stage, spread in percentiles.items() if spread is not None}
-    one_clock = all(0.0 <= spread.median <= 10.0 for spread in stages.values())
-    return stages if one_clock and any(spread.maximum > 0.0 for spread in stages.values()) else {}
+    stages = dict(zip((channel.recorded for channel in answers), STAGES, strict=True))
+    percentiles = {stages[topic]: Percentiles.of(times) for topic, times in latencies.items()}
+    known = {stage: spread for stage, spread in percentiles.items() if spread is not None}
+    one_clock = all(0.0 <= spread.median <= 10.0 for spread in known.values())
+    return known if one_clock and any(spread.maximum > 0.0 for spread in known.values()) else {}
 
 
 def _answered_stamp(record: RecordedMessage) -> int:
@@ -371,4 +344,4 @@ def _answered_stamp(record: RecordedMessage) -> int:
         message = record.decode()
     except BagError:
         return 0
-    return 0 if message.stop else int(message.command.sec * 1_000_000_000 + message.command.nanosec)
+    return 0 if message.stop else nanoseconds(message.command)

@@ -1,4 +1,4 @@
-"""Tables: a row for each evaluated bag, as a file; and the figures of a replay or a closed loop for a terminal."""
+"""Figures of a replay, a closed loop and evaluated bags: as JSON, as a table in a file, and for a terminal."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias, cast
 
@@ -15,11 +16,19 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.evaluation.frames import TimeSeries
-from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary, RunSummary
+from magnetosuture_thread.bags.reading import nanoseconds, planar_pose
+from magnetosuture_thread.evaluation.frames import (
+    Array,
+    CurrentDifference,
+    FrameResult,
+    GraphCollector,
+    TimeSeries,
+    rms,
+)
 from magnetosuture_thread.evaluation.metrics import (
-    KINDS,
     TARGETS,
+    EstimationFigures,
+    MinimumMargin,
     Percentiles,
     RunMetrics,
     SensorSilence,
@@ -27,15 +36,249 @@ from magnetosuture_thread.evaluation.metrics import (
     finite_or_none,
 )
 from magnetosuture_thread.geometry.barrier import BUILT_IN
-from magnetosuture_thread.settings.errors import ConfigurationError, printable
+from magnetosuture_thread.geometry.needle_arc import needle_axis
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import ConfigurationError, GraphError, printable
 
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 
-STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
+STAGES = ("frame to needle pose", "frame to prediction", "command to currents")  # of a recorded graph
 TEXTS = ("bag", "path", "setup", "simulated", "source", "formulation", "damage", "unverified", "problem")
 TIMES = ("step_median_s", "step_p99_s", "tracker_median_s", "tracker_p99_s")  # differ from run to run
 ENDINGS = (".json", ".csv", ".parquet")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """The figures that a replay and a closed loop have in common.
+
+    Attributes:
+        setup: the setup's name.
+        frames: camera frames, lost ones too, or recorded poses.
+        tracked: frames with a pose.
+        predicted: frames with a predicted thread.
+        latency: of each stage, or from a frame's stamp to the arrival of what was made of it [s].
+        step_time: of the model's step [s].
+        stretch: greatest absolute stretch of a segment.
+        seen_share: part of the thread's length that the camera saw, mean over the predicted frames.
+        error_seen: prediction error against the seen centreline [% of length], over `count` frames.
+        error_truth: the same against the truth, where the bag holds it.
+        prediction: errors of the prediction; see `compare_errors`.
+        estimate: errors of the estimate, under the same names.
+    """
+
+    setup: str
+    frames: int
+    tracked: int
+    predicted: int
+    latency: dict[str, Percentiles | None]
+    step_time: Percentiles | None
+    stretch: float
+    seen_share: float
+    error_seen: dict[str, float] | None
+    error_truth: dict[str, float] | None
+    prediction: dict[str, float | None] = field(default_factory=dict)
+    estimate: dict[str, float | None] = field(default_factory=dict)
+
+
+def figures_of(metrics: RunMetrics) -> dict[str, Any]:
+    """Return the fields of `RunSummary` that the metrics of a run give, by their names."""
+    errors = metrics.errors()
+    return {
+        "predicted": len(metrics.series),
+        "step_time": metrics.percentiles("step_time"),
+        "stretch": metrics.maximum("strain"),
+        "seen_share": metrics.mean("seen_share"),
+        "error_seen": errors["seen"],
+        "error_truth": errors["truth"],
+        **compare_errors(metrics.series),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySummary(RunSummary):
+    """The figures of a replayed bag.
+
+    Attributes:
+        bag: its path.
+        simulated: what was simulated, empty if the bag does not say that anything was.
+        commands: needle velocity commands played.
+        driven: commands that reached the coils.
+        least_margins: of each kind.
+        contact_frames: predicted frames in which the thread touches an obstacle.
+        residual: greatest scaled residual of a solve.
+        peak_tension: greatest tension of a segment [N]; None where no force is known.
+        needle_pull: greatest force of the thread upon the needle [N]; None where no force is known.
+        estimation: what else there is of the estimate.
+        currents: difference of the coils' currents from the recorded ones, where the bag holds any.
+        source: `camera`, or `poses` where `frames` are recorded poses.
+        speed: how many seconds of the bag were worked through in a second, of an offline replay; else None.
+        refused: frames and poses that could not be used, by why.
+        dropped: messages that got lost on a way, by which; empty offline, where there are none.
+        silence: time without frames, or poses.
+        damage: what of the bag could not be read, empty if nothing.
+        unverified: why any message of the bag may be wrong, empty if nothing speaks against them.
+        remark: what else to know of the bag, empty if nothing.
+    """
+
+    bag: str
+    simulated: str
+    commands: int
+    driven: int
+    least_margins: list[MinimumMargin]
+    contact_frames: int
+    residual: float
+    peak_tension: float | None = None
+    needle_pull: float | None = None
+    estimation: EstimationFigures = field(default_factory=EstimationFigures)
+    currents: CurrentDifference | None = None
+    source: str = "camera"
+    speed: float | None = None
+    refused: dict[str, int] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
+    silence: SensorSilence = field(default_factory=SensorSilence)
+    damage: str = ""
+    unverified: str = ""
+    remark: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""
+        figures = asdict(self)
+        events = figures.pop("estimation")["disturbances"]
+        figures["silence"]["at"] = finite_or_none(self.silence.at)
+        return figures | self.estimation.to_json() | {"disturbances": list(events)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopSummary(RunSummary):
+    """The figures of a closed loop. Everything in it is simulated.
+
+    Attributes:
+        duration: from the start of the steering until the path was done, or to the end; all figures are of
+            this time [s].
+        skipped: frames that are missing: the rig had no time for them.
+        lost: frames that the tracker looked at without giving a pose.
+        wrong: poses farther from the truth than 0.3 mm or 5 degrees.
+        saturated: share of the currents at a limit.
+        tail_error: distance of the tracked tail from the truth, root of the mean square [m].
+        heading_error: of the tracked heading, the same [rad].
+        path_error: distance of the needle's true tip from where the path wanted it, the same [m].
+        path_error_greatest: greatest such distance [m].
+        processing: of a frame in the tracker [s].
+        procedure: what came of a procedure; None for a path that was followed.
+        too_slow: that the computer was too slow for the run, and what to do; empty if it was not.
+    """
+
+    duration: float
+    skipped: int
+    lost: int
+    wrong: int
+    saturated: float
+    tail_error: float
+    heading_error: float
+    path_error: float
+    path_error_greatest: float
+    processing: Percentiles | None
+    procedure: dict[str, Any] | None = None
+    too_slow: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as plain values, None where there is none; units as above."""
+        return {key: finite_or_none(value) for key, value in asdict(self).items()}
+
+
+class LoopCollector:
+    """Puts the messages of a closed loop side by side by their stamps.
+
+    Args:
+        thread_length: [m]
+        needle_length: along the needle's body [m].
+        needle_curvature: of its arc [1/m].
+        frame_rate: of the camera [Hz].
+
+    Attributes:
+        instants: the predicted frames by time, once `summary` was asked for.
+    """
+
+    def __init__(self, thread_length: float, needle_length: float, needle_curvature: float, frame_rate: float) -> None:
+        self._threads = GraphCollector()
+        self._needle = needle_length, needle_curvature
+        self._rate, self._length = frame_rate, thread_length
+        self._truth: dict[int, Array] = {}
+        self._tracked: dict[int, Array] = {}
+        self._setpoints: dict[int, Array] = {}
+        self._arrived: dict[str, dict[int, int]] = {interface.NEEDLE_POSE.name: {}, interface.PREDICTED_THREAD.name: {}}
+        self._states: dict[int, tuple[int, float]] = {}
+        self._saturated: list[bool] = []
+        self.instants: list[FrameResult] = []
+
+    def add(self, topic: str, time: int, message: Any) -> None:
+        """Add one message that arrived at a time [ns]."""
+        self._threads.add(topic, message)
+        if not hasattr(message, "header"):
+            return
+        stamp = nanoseconds(message.header.stamp)
+        match topic:
+            case interface.GROUND_TRUTH_NEEDLE.recorded:
+                self._truth[stamp] = np.array(planar_pose(message.pose))
+            case interface.TIP_SETPOINT.recorded:
+                self._setpoints[stamp] = np.array(planar_pose(message.pose))
+            case interface.NEEDLE_POSE.recorded:
+                self._tracked[stamp] = np.array(planar_pose(message.pose.pose))
+            case interface.TRACKER_STATE.recorded:
+                self._states[stamp] = (message.state, message.processing_time)
+            case interface.CURRENTS.recorded:
+                self._saturated.append(bool(message.saturated))
+        if topic.lstrip("/") in self._arrived:
+            self._arrived[topic.lstrip("/")].setdefault(stamp, time)
+
+    def summary(self, setup: str) -> LoopSummary:
+        """Return the figures.
+
+        Raises:
+            GraphError: there is no frame with a pose and its truth.
+        """
+        first, last = (min(self._setpoints), max(self._setpoints)) if self._setpoints else (0, 0)
+        if self._setpoints and self._threads.health.get("path_follower") != "done":
+            last = max(self._truth, default=last)  # who steers is silent while the needle is lost
+        frames = {stamp for stamp in self._truth if first <= stamp <= last}
+        both = sorted(self._tracked.keys() & frames)
+        if not both:
+            health = "; ".join(f"{name}: {text}" for name, text in sorted(self._threads.health.items()))
+            raise GraphError(f"the needle was tracked in no frame; {health}")
+        self.instants = self._threads.frames(first, last)
+        apart = np.array([self._tracked[stamp] - self._truth[stamp] for stamp in both])
+        tail, heading = np.linalg.norm(apart[:, :2], axis=1), np.abs(np.angle(np.exp(1j * apart[:, 2])))
+        off = np.array([np.linalg.norm(self._tip(s) - self._setpoints[s][:2]) for s in both if s in self._setpoints])
+        states = [state for stamp, state in self._states.items() if stamp in frames]
+        return LoopSummary(
+            setup=setup,
+            duration=(last - first) * 1e-9,
+            frames=len(frames),
+            skipped=max(0, round((last - first) * 1e-9 * self._rate) + 1 - len(frames)),
+            tracked=len(both),
+            lost=sum(state != 1 for state, _ in states),  # TrackerState.TRACKED
+            wrong=int(np.sum((tail > 0.3e-3) | (heading > np.radians(5.0)))),
+            saturated=float(np.mean(self._saturated or [False])),
+            tail_error=rms(tail),
+            heading_error=rms(heading),
+            path_error=rms(off),
+            path_error_greatest=float(off.max(initial=0.0)),
+            processing=Percentiles.of([taken for _, taken in states]),
+            latency={
+                name: Percentiles.of([1e-9 * (at - stamp) for stamp, at in arrived.items() if stamp in self._setpoints])
+                for name, arrived in self._arrived.items()
+            },
+            **figures_of(RunMetrics.of(self._length, self.instants)),
+        )
+
+    def _tip(self, stamp: int) -> Points:
+        """Return where the needle's true tip was."""
+        x, y, heading = self._truth[stamp]
+        points, _ = needle_axis(np.array([x, y]), heading, *self._needle, np.ones(1))
+        return np.asarray(points[0])
 
 
 def row_of(
@@ -55,15 +298,9 @@ def row_of(
         facts: the columns of `TEXTS`, `duration_s` and `refused`.
     """
     silence = silence or SensorSilence()
-    row: Row = dict.fromkeys(TEXTS[:6], "") | {
-        "duration_s": None,
-        "frames": len(metrics.observed),
-        "tracked": metrics.tracked,
-        "predicted": len(metrics.series),
-        "silent_s": silence.total,
-        "max_silence_s": silence.max_gap,
-        "silences": silence.gaps,
-    }
+    row: Row = dict.fromkeys(TEXTS[:6], "") | {"duration_s": None}
+    row |= {"frames": len(metrics.observed), "tracked": metrics.tracked, "predicted": len(metrics.series)}
+    row |= {"silent_s": silence.total, "max_silence_s": silence.max_gap, "silences": silence.gaps}
     for prefix in ("error", "recorded_error"):
         errors = metrics.errors(prefix)
         for target in TARGETS:
@@ -93,12 +330,10 @@ def row_of(
     return {column: finite_or_none(value) for column, value in row.items()}
 
 
-_EMPTY = row_of(RunMetrics(1.0))
-
-
 def failed_row(name: str, path: str, problem: str) -> Row:
     """Return the row of a bag that could not be evaluated."""
-    row: Row = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in _EMPTY.items()}
+    empty = row_of(RunMetrics(1.0))
+    row: Row = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in empty.items()}
     return row | dict.fromkeys(TEXTS, "") | {"bag": name, "path": path, "problem": problem}
 
 
@@ -135,10 +370,10 @@ def write_table(path: Path, rows: Sequence[Row], document: Any) -> None:
         document: what JSON gets.
     """
     if path.suffix == ".parquet":
-        from pyarrow import Table as ArrowTable
+        import pyarrow
         from pyarrow import parquet
 
-        parquet.write_table(ArrowTable.from_pylist([flat(row) for row in rows]), path)
+        parquet.write_table(pyarrow.Table.from_pylist([flat(row) for row in rows]), path)
     elif path.suffix == ".csv":
         path.write_text(table_csv(rows), encoding="utf-8", newline="")
     else:
@@ -182,12 +417,12 @@ def bags_document(rows: Sequence[Row]) -> dict[str, Any]:
 
 def compare_bags(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return the errors of `prediction` and `estimate` over bags; None where no bag has any."""
-    compared: dict[str, dict[str, float | None]] = compare_errors(TimeSeries())
-    for kind in KINDS:
-        for name in compared[kind]:
+    compared = compare_errors(TimeSeries())
+    for kind, errors in compared.items():
+        for name in errors:
             values = _numbers([cast("Row", row[kind]) for row in rows], name)
             whole = np.mean if name.endswith("_mean_percent") else np.max
-            compared[kind][name] = float(whole(values)) if values else None
+            errors[name] = float(whole(values)) if values else None
     return compared
 
 
@@ -271,9 +506,9 @@ def outcome_line(outcome: Mapping[str, Any]) -> tuple[str, str, str]:
 
 def micrometres(metres: float) -> str:
     """Return a margin as text; what is 0 within the solvers' tolerance is written so."""
-    return (
-        "0 µm" if abs(metres) <= 1e-9 else f"{1e6 * metres:.3g} µm" if abs(metres) < 1e-4 else f"{1e3 * metres:.3g} mm"
-    )
+    if abs(metres) <= 1e-9:
+        return "0 µm"
+    return f"{1e6 * metres:.3g} µm" if abs(metres) < 1e-4 else f"{1e3 * metres:.3g} mm"
 
 
 def _figures_table(title: str, lines: Mapping[str, str]) -> Table:

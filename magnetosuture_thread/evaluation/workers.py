@@ -26,12 +26,9 @@ Work = Callable[[Any, Log, Progress], Any]
 Results = Iterator[tuple[int, Any]]  # index of a task, and what came of it
 
 # A worker is one of as many as there are processors for: what it uses must not start a thread for each of them.
-ONE_THREAD = (
-    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
-    "OPENCV_FOR_THREADS_NUM",
-)
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
+ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")] + ["OPENCV_FOR_THREADS_NUM"]
 CONNECT_TIMEOUT = 20.0  # s to reach a scheduler
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
 # A result has the same bits only where these are the same. OpenCV comes by pip or as Ubuntu's package.
 SOFTWARE = ("magnetosuture_thread", "numpy", "scipy", "numba", "opencv-python-headless", "osqp")
 _ONE_AT_A_TIME = threading.Lock()  # in a worker of several threads: matplotlib is not made for them

@@ -23,10 +23,8 @@ from rclpy.time import Time
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape, read_scene
-from magnetosuture_thread.bags.markers import forecast_events
-from magnetosuture_thread.bags.packing import packed_header, packed_point, packed_twist
-from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose
-from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.packing import forecast_events, packed_header, packed_point, packed_twist
+from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose, parse_scene_message
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.estimator.disturbance import disturbance_text

@@ -30,7 +30,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor

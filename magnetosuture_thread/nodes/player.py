@@ -14,8 +14,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.bags.cdr import header_stamp
-from magnetosuture_thread.bags.reading import nanoseconds
+from magnetosuture_thread.bags.reading import header_stamp, nanoseconds
 from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Participant, listen

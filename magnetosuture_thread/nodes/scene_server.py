@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
-from magnetosuture_thread.bags.markers import packed_scene_markers
-from magnetosuture_thread.bags.scene_message import packed_scene, parse_shape_message
+from magnetosuture_thread.bags.packing import packed_scene, packed_scene_markers
+from magnetosuture_thread.bags.reading import parse_shape_message
 from magnetosuture_thread.geometry.scene_files import SceneEditor, SceneServerSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode

@@ -24,9 +24,13 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.cdr import header_stamp
-from magnetosuture_thread.bags.markers import packed_forecast_markers, packed_thread_markers
-from magnetosuture_thread.bags.packing import estimate_outputs, packed_forecast, prediction_outputs
+from magnetosuture_thread.bags.packing import (
+    estimate_outputs,
+    packed_forecast,
+    packed_forecast_markers,
+    packed_thread_markers,
+    prediction_outputs,
+)
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import WAITING, PredictionResult, ThreadSession
@@ -158,7 +162,7 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
 
     def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], take: Callable[..., Any]) -> None:
         """Take a message about the thread; without an estimate most are not needed, and only their stamp is read."""
-        stamp = header_stamp(data) or 0
+        stamp = reading.header_stamp(data) or 0
         if self._session.estimates or self._session.needs_measured_thread(stamp):
             topic.decoded(self, data, lambda message: self._report_all(take(stamp, read(message))))
 

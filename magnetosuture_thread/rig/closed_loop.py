@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags import packing
-from magnetosuture_thread.bags.scene_message import packed_scene
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.coils.bridge import NEEDLE, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState

@@ -188,7 +188,7 @@ def test_a_file_of_a_bag_that_cannot_be_fetched_is_no_damage(tmp_path: Path, mon
             raise OSError(5, "Input/output error")
         return open_file(path)
 
-    monkeypatch.setattr("magnetosuture_thread.bags.mcap.open_file", open_first)
+    monkeypatch.setattr("magnetosuture_thread.bags.storage.open_file", open_first)
     assert "Input/output error" in str(Bag(folder).damage)
     with pytest.raises(BagError, match=r"run_1\.mcap: cannot be read: Input/output error"):
         Bag(parse_location("memory://run"))

@@ -16,11 +16,10 @@ import pytest
 
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import packed_compressed_image
+from magnetosuture_thread.bags.packing import packed_compressed_image, packed_scene
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.recorded import BagInput, ObservationReader, Step, chosen_source, predictions
@@ -191,7 +190,7 @@ def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, 
     broken = "image.data: got damaged bytes, expected a JPEG or PNG image, or BMP, TIFF, WebP, as a whole"
     assert summary.refused == {"no needle for sure": 2, broken: 2}
     summary = replay_offline(changed(pose_bag, tmp_path / "bent", torn), tmp_path / "out2")
-    assert (summary.tracked, summary.refused) == (28, {"a pose that is none": 2})
+    assert (summary.tracked, summary.refused) == (28, {"a pose that is not valid": 2})
 
 
 def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_path: Path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc

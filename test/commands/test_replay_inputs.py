@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.scene_message import packed_scene, parse_scene_message
+from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.live import GraphInput
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE, BagInput, open_bag

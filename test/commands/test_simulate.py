@@ -17,7 +17,7 @@ import pytest
 
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands import reproduce
 from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate

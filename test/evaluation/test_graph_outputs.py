@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, LoopCollector
-from magnetosuture_thread.evaluation.metrics import stage_latencies
+from magnetosuture_thread.evaluation.frames import CurrentSeries, GraphCollector
+from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
+from magnetosuture_thread.evaluation.tables import LoopCollector
 from magnetosuture_thread.settings.errors import GraphError
 
 STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])
@@ -56,7 +57,7 @@ def margins(second: int, clearance: float, valid: bool = True) -> Message:
 
 
 def test_messages_of_one_stamp_are_put_together():
-    collector = GraphCollector(length=1.0)
+    collector = GraphCollector()
     for k, clearance in ((1, 0.5), (2, -0.1), (3, 0.2)):
         force = Message(x=3.0 - k, y=0.0)
         collector.add("/thread/predicted", prediction(k, STRAIGHT, tension=[0.5, 1.0], needle_force=force))
@@ -67,7 +68,8 @@ def test_messages_of_one_stamp_are_put_together():
     collector.add("/ground_truth/thread", path(2, STRAIGHT + 2.0 * UP))
     collector.add("/thread/measured", path(9, STRAIGHT))  # without a prediction
     collector.add("/thread/margins", margins(9, -7.0, valid=False))
-    metrics, instants = collector.metrics(start=10**9), collector.frames()
+    instants = collector.frames()
+    metrics = RunMetrics.of(1.0, instants, 10**9)
     assert [instant.stamp for instant in instants] == [10**9, 2 * 10**9, 3 * 10**9]
     assert [instant.errors["seen"] for instant in instants] == pytest.approx([1.0] * 3)
     assert [instant.errors["truth"] for instant in instants] == pytest.approx([math.nan, 2.0, math.nan], nan_ok=True)

@@ -13,19 +13,7 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.evaluation.hernia import (
-    PAPER_SEGMENTS,
-    HerniaRun,
-    RecordedCommands,
-    draw_animation,
-    draw_hernia,
-    paper_model,
-    point_filter,
-    read_steering,
-    replay_hernia,
-    replay_steering,
-    start_centreline,
-)
+from magnetosuture_thread.evaluation import hernia
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.rig.setups import read_setup
 
@@ -33,13 +21,13 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 STEERING = EXAMPLES / "hernia_steering"
 
 
-def test_picture_and_animation_show_the_run(run: HerniaRun, tmp_path: Path):
-    (tmp_path / "hernia.png").write_bytes(draw_hernia(run))
+def test_picture_and_animation_show_the_run(run: hernia.HerniaRun, tmp_path: Path):
+    (tmp_path / "hernia.png").write_bytes(hernia.draw_hernia(run))
     picture = cv2.imread(str(tmp_path / "hernia.png"))
     assert picture is not None
     for blue, green, red in ((84, 158, 31), (80, 166, 240)):  # a free thread, and one under friction, in BGR
         assert (np.abs(picture.astype(int) - (blue, green, red)).max(axis=2) < 40).sum() > 50
-    (tmp_path / "hernia.gif").write_bytes(draw_animation(replace(run, instants=run.instants[:100])))
+    (tmp_path / "hernia.gif").write_bytes(hernia.draw_animation(replace(run, instants=run.instants[:100])))
     frames = cv2.VideoCapture(str(tmp_path / "hernia.gif"))
     first, second = frames.read(), frames.read()
     assert first[0]
@@ -48,20 +36,22 @@ def test_picture_and_animation_show_the_run(run: HerniaRun, tmp_path: Path):
 
 
 def test_a_command_holds_for_a_tenth_of_a_second():
-    given = RecordedCommands(np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.0, 2.0]]))
+    given = hernia.RecordedCommands(np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.0, 2.0]]))
     found = [given.at(time).tolist() for time in (0.9, 1.0, 1.1, 1.11, 2.05, 2.2)]
     assert found == [[0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 2.0], [0.0, 0.0]]
 
 
 @pytest.fixture(scope="module")
-def run() -> HerniaRun:
+def run() -> hernia.HerniaRun:
     """The steering that ships, replayed."""
     setup = read_setup("hernia_ring")
-    needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
-    return replay_steering(paper_model(setup), start_centreline(setup), read_steering(Bag(STEERING)), needle)
+    needle = hernia.point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
+    return hernia.replay_steering(
+        hernia.paper_model(setup), hernia.start_centreline(setup), hernia.read_steering(Bag(STEERING)), needle
+    )
 
 
-def test_six_instants_tell_the_papers_story(run: HerniaRun):
+def test_six_instants_tell_the_papers_story(run: hernia.HerniaRun):
     instants = run.figures("hernia_ring")["instants"]
     free, penetrated, slack, *wrapped = instants
     assert [round(instant["time"]) for instant in instants] == [0, 12, 17, 27, 35, 55]
@@ -84,7 +74,7 @@ def test_six_instants_tell_the_papers_story(run: HerniaRun):
     assert speeds[2] < 0.15
 
 
-def test_the_thread_goes_around_the_ring_and_is_tight_on_it(run: HerniaRun):
+def test_the_thread_goes_around_the_ring_and_is_tight_on_it(run: hernia.HerniaRun):
     ring = run.scene.obstacles[0]
     vertices = run.nearest(55.0).prediction.positions
     assert isinstance(ring, Polygon)
@@ -96,7 +86,7 @@ def test_the_thread_goes_around_the_ring_and_is_tight_on_it(run: HerniaRun):
     assert (np.linalg.norm(wrapped - centre, axis=1) - 6e-3).max() < 9e-4
 
 
-def test_the_needle_goes_where_it_is_told_and_slower_under_friction(run: HerniaRun):
+def test_the_needle_goes_where_it_is_told_and_slower_under_friction(run: hernia.HerniaRun):
     for last, instant in pairwise(run.instants):
         assert instant.command is not None
         slowdown = last.margins.friction.slowdown
@@ -107,7 +97,7 @@ def test_the_needle_goes_where_it_is_told_and_slower_under_friction(run: HerniaR
             np.testing.assert_allclose(instant.command.filtered, slowdown * instant.command.commanded, atol=1e-9)
 
 
-def test_no_node_is_ever_in_an_obstacle_and_no_segment_stretched(run: HerniaRun):
+def test_no_node_is_ever_in_an_obstacle_and_no_segment_stretched(run: hernia.HerniaRun):
     """The issue's bounds: 1e-6 m, and 1 %."""
     figures = run.figures("hernia_ring")
     assert figures["deepest"] < 1e-6
@@ -116,12 +106,12 @@ def test_no_node_is_ever_in_an_obstacle_and_no_segment_stretched(run: HerniaRun)
 
 
 def test_the_job_leaves_figures_and_a_picture(tmp_path: Path):
-    found = replay_hernia(STEERING, tmp_path / "out")
+    found = hernia.replay_hernia(STEERING, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["hernia.json", "hernia.png"]
     figures = json.loads((tmp_path / "out" / "hernia.json").read_text())
     assert figures == found
     assert figures["most_friction"] > 15
-    assert figures["nodes"] == PAPER_SEGMENTS != read_setup("hernia_ring").model.segments
+    assert figures["nodes"] == hernia.PAPER_SEGMENTS != read_setup("hernia_ring").model.segments
     assert figures["simulated"]
 
 

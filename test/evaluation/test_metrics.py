@@ -10,15 +10,8 @@ import pytest
 from scipy.stats import chi2
 
 from magnetosuture_thread.estimator import Disturbance
+from magnetosuture_thread.evaluation import metrics
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
-from magnetosuture_thread.evaluation.metrics import (
-    Consistency,
-    HiddenShares,
-    RunMetrics,
-    SensorSilence,
-    mean_band,
-    prediction_error_percent,
-)
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import Prediction
 from test.evaluation.runs import margins
@@ -30,7 +23,7 @@ LINE = np.column_stack([-np.linspace(0.0, 1.0, 9), np.zeros(9)])
 
 def test_a_minimum_margin_is_of_one_row_and_the_deepest_chord_of_all():
     """The chord at node 7 is deep at first; later node 3 itself is in the shape."""
-    run = RunMetrics(1.0)
+    run = metrics.RunMetrics(1.0)
     for k, (node, value, clearance) in enumerate(((7, 2.0, -15.0), (3, -3.0, -5.0)), 1):
         row = np.array([node], np.uint32), np.zeros(1, np.int32), np.array([value]), np.array([clearance])
         run.add(FrameResult(k * 10**9, vertices=STRAIGHT, margins=Margins((BarrierMargins("obstacle", *row),))))
@@ -39,7 +32,7 @@ def test_a_minimum_margin_is_of_one_row_and_the_deepest_chord_of_all():
 
 
 def test_of_a_run_numbers_are_kept_and_the_worst_in_full():
-    run = RunMetrics(1.0, 10**9)
+    run = metrics.RunMetrics(1.0, 10**9)
     strain = np.array([0.0, -0.002, 0.001, 0.0])
     for k, (y, clearance) in enumerate(((0.01, 0.5), (0.03, -0.1), (0.02, 0.2), (9.0, None)), 1):
         nodes = STRAIGHT + np.array([0.0, y])
@@ -69,34 +62,34 @@ def test_the_error_is_of_the_nodes_that_are_known_and_none_of_less_than_half():
     curve = np.column_stack([np.linspace(0.0, 1.0, 101), np.zeros(101)])
     moved = NODES + np.array([0.0, 0.02])
     moved[0] = 9.0  # the needle's
-    assert prediction_error_percent(moved, curve, 1.0) == pytest.approx(2.0)
+    assert metrics.prediction_error_percent(moved, curve, 1.0) == pytest.approx(2.0)
     moved[8:] += 5.0
-    assert prediction_error_percent(moved, curve[:76], 1.0) == pytest.approx(2.0)
+    assert metrics.prediction_error_percent(moved, curve[:76], 1.0) == pytest.approx(2.0)
     for short in (curve[:0], curve[:1], curve[:41]):
-        assert np.isnan(prediction_error_percent(NODES, short, 1.0))
+        assert np.isnan(metrics.prediction_error_percent(NODES, short, 1.0))
 
 
 @pytest.mark.parametrize(
     ("times", "expected"),
     [
-        (np.delete(np.arange(0.0, 360.0, 0.1), [50, 51, 52, 90]), SensorSilence()),  # 0.4 s
+        (np.delete(np.arange(0.0, 360.0, 0.1), [50, 51, 52, 90]), metrics.SensorSilence()),  # 0.4 s
         (
             np.concatenate([np.arange(0.0, 60.0, 0.1), np.arange(300.0, 360.0, 0.1)]),
-            SensorSilence(1, 240.1, 240.1, 59.9),
+            metrics.SensorSilence(1, 240.1, 240.1, 59.9),
         ),
-        (np.arange(100.0, 200.0, 0.1), SensorSilence(2, 260.1, 160.1, 199.9)),
-        (np.concatenate([np.arange(0.0, 360.0, 0.1), [-1.7e9]]), SensorSilence()),  # a frame stamped 0
+        (np.arange(100.0, 200.0, 0.1), metrics.SensorSilence(2, 260.1, 160.1, 199.9)),
+        (np.concatenate([np.arange(0.0, 360.0, 0.1), [-1.7e9]]), metrics.SensorSilence()),  # a frame stamped 0
     ],
 )
-def test_the_silence_of_a_sensor_is_counted(times: np.ndarray, expected: SensorSilence):
-    found = SensorSilence.of(times, 0.0, 360.0)
+def test_the_silence_of_a_sensor_is_counted(times: np.ndarray, expected: metrics.SensorSilence):
+    found = metrics.SensorSilence.of(times, 0.0, 360.0)
     assert found.gaps == expected.gaps
     assert (found.total, found.max_gap) == pytest.approx((expected.total, expected.max_gap), abs=0.2)
     assert found.at == pytest.approx(expected.at, abs=0.2, nan_ok=True)
 
 
 def test_an_estimate_is_measured_beside_a_prediction_that_is_nowhere():
-    run, nowhere = RunMetrics(1.0), STRAIGHT.copy()
+    run, nowhere = metrics.RunMetrics(1.0), STRAIGHT.copy()
     nowhere[3] = np.nan
     run.add(FrameResult(0, vertices=nowhere, ground_truth=LINE, estimate=EstimatedThread(STRAIGHT)))
     assert not len(run.series.known("error_truth"))
@@ -115,10 +108,10 @@ def frame(stamp: float, estimate: EstimatedThread | None, **others: Any) -> Fram
 def test_innovations_are_within_their_band_if_they_are_as_expected(scale: float):
     squared = scale * np.random.default_rng(1).standard_normal((2000, 16)) ** 2
     squared[::3, 5:] = np.nan  # hidden
-    run = RunMetrics(1.0)
+    run = metrics.RunMetrics(1.0)
     for k, row in enumerate(squared):
         run.add(frame(0.1 * k, EstimatedThread(STRAIGHT, True, row)))
-    found = Consistency.of(run.series)
+    found = metrics.Consistency.of(run.series)
     assert found is not None
     assert found.windows == 40
     assert found.width == pytest.approx(199.9 / 40)
@@ -129,21 +122,21 @@ def test_innovations_are_within_their_band_if_they_are_as_expected(scale: float)
         assert found.within == 0
         assert (found.means > found.high).all()
     counts = np.array([16.0, 2400.0])
-    for count, low, high in zip(counts, *mean_band(counts), strict=True):
+    for count, low, high in zip(counts, *metrics.mean_band(counts), strict=True):
         assert chi2.cdf((low * count, high * count), count) == pytest.approx((0.025, 0.975))
 
 
 def test_hidden_shares_are_of_time_and_not_of_frames():
-    run = RunMetrics(1.0)
+    run = metrics.RunMetrics(1.0)
     for time in [*np.arange(0.0, 1.0, 0.1), *np.arange(1.0, 2.0, 0.05)]:
         run.add(frame(time, EstimatedThread(STRAIGHT, time < 1.5), measured=LINE[:5] if time < 1.0 else LINE))
-    found = HiddenShares.of(run.series)
+    found = metrics.HiddenShares.of(run.series)
     assert found is not None
     assert (found.time, found.all_time, found.length) == pytest.approx((0.75, 0.25, 0.5), abs=0.02)
 
 
 def test_disturbances_of_one_beginning_are_one_event():
-    run = RunMetrics(1.0, 10**10)
+    run = metrics.RunMetrics(1.0, 10**10)
     place = np.array([0.1, 0.2])
     for time, since, significance in (
         (10.0, None, 0.0),

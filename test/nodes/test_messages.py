@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.serialization import serialize_message
 
-from magnetosuture_thread.bags import markers, packing, reading
+from magnetosuture_thread.bags import packing, reading
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.scene_message import packed_scene
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
@@ -130,10 +130,10 @@ PACKED = {
     "margins": (interface.MARGINS, packing.packed_margins(7, MARGINS)),
     "no margins": (interface.MARGINS, packing.packed_margins(7, None, "for a reason", "0123456789abcdef")),
     "scene": (interface.SCENE, packed_scene(7, every_shape())),
-    "scene markers": (interface.SCENE_MARKERS, markers.packed_scene_markers(7, every_shape())),
+    "scene markers": (interface.SCENE_MARKERS, packing.packed_scene_markers(7, every_shape())),
     "thread markers": (
         interface.THREAD_MARKERS,
-        markers.packed_thread_markers(7, prediction(), MARGINS, 1e-4, an_estimate(2)),
+        packing.packed_thread_markers(7, prediction(), MARGINS, 1e-4, an_estimate(2)),
     ),
 }
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from rclpy.serialization import serialize_message
 
-from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics

@@ -14,8 +14,7 @@ from magnetosuture_msgs.msg import FilterState
 from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import Disc, ForecastStart, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
-from magnetosuture_thread.bags.markers import forecast_text
-from magnetosuture_thread.bags.packing import packed_forecast
+from magnetosuture_thread.bags.packing import forecast_text, packed_forecast
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import make_path_follower

@@ -9,7 +9,7 @@ from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
 from magnetosuture_thread.bags import packing
-from magnetosuture_thread.bags.scene_message import packed_scene
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import Topic
 

@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from rclpy.serialization import deserialize_message
 
-from magnetosuture_thread.bags import scene_message as messages
+from magnetosuture_thread.bags import packing, reading
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
@@ -32,18 +32,18 @@ SCENES = {
 
 def sent(scene: Scene) -> SceneMessage:
     """Return a scene as a node gets it."""
-    return deserialize_message(messages.packed_scene(7, scene), SceneMessage)
+    return deserialize_message(packing.packed_scene(7, scene), SceneMessage)
 
 
 def recorded(scene: Scene) -> Any:
     """Return a scene as a bag gives it."""
-    return typestore().deserialize_cdr(messages.packed_scene(7, scene), SCENE.type_name)
+    return typestore().deserialize_cdr(packing.packed_scene(7, scene), SCENE.type_name)
 
 
 @pytest.mark.parametrize("way", [sent, recorded])
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_goes_there_and_back(way: Callable[[Scene], Any], name: str):
-    again = messages.parse_scene_message(way(SCENES[name]))
+    again = reading.parse_scene_message(way(SCENES[name]))
     assert again == SCENES[name]
     assert again.version == SCENES[name].version
 
@@ -84,7 +84,7 @@ def test_a_damaged_message_is_refused_in_one_line(harm: Callable[[Any], None], w
     message = recorded(every_shape())
     harm(message)
     with pytest.raises(InvalidInputError) as caught:
-        messages.parse_scene_message(message)
+        reading.parse_scene_message(message)
     assert str(caught.value).startswith(words)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
@@ -95,11 +95,11 @@ def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it():
     ring = message.shapes[1].polygon[0]
     ring.holes = [ring.holes[0]] * 41
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes\.polygon: got 4\d, expected at most 40$"):
-        messages.parse_scene_message(message)
+        reading.parse_scene_message(message)
     ring.holes = []
     ring.outline.corners = [ring.outline.corners[0]] * 1501
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes\.polygon\.corners: got \d{4}, expected at most 1500$"):
-        messages.parse_scene_message(message)
+        reading.parse_scene_message(message)
     message.shapes = [message.shapes[0]] * 201
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes: got 201, expected at most 200$"):
-        messages.parse_scene_message(message)
+        reading.parse_scene_message(message)
