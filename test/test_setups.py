@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import find_file, share_directory

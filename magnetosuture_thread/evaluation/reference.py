@@ -21,8 +21,7 @@ from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics, nod
 from magnetosuture_thread.evaluation.workers import Progress
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread

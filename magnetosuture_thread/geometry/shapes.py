@@ -286,10 +286,7 @@ def _arc(before: Vertex, corner: Vertex, after: Vertex, turned: float, tangent: 
         yield x + along * ux - across * uy, y + along * uy + across * ux
     # The last point from its own edge: rounding in the arc must not bend that edge.
     length = math.dist(corner, after)
-    yield (
-        corner[0] + tangent * (after[0] - corner[0]) / length,
-        corner[1] + tangent * (after[1] - corner[1]) / length,
-    )
+    yield (corner[0] + tangent * (after[0] - corner[0]) / length, corner[1] + tangent * (after[1] - corner[1]) / length)
 
 
 Obstacle = Disc | Polygon

@@ -85,12 +85,7 @@ class Rig:
     """
 
     def __init__(
-        self,
-        settings: RigSettings,
-        scene: Scene,
-        *,
-        max_time: float = math.inf,
-        max_iterations: float = math.inf,
+        self, settings: RigSettings, scene: Scene, *, max_time: float = math.inf, max_iterations: float = math.inf
     ) -> None:
         settings.check_scene(scene)
         self._settings, self.scene = settings, scene

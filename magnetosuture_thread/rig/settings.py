@@ -16,12 +16,11 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_checks import find_collision
 from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting, Look
+from magnetosuture_thread.rig.contact import Surface
+from magnetosuture_thread.rig.dynamics import CoilField, NeedleBody, RigDynamics
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
-from magnetosuture_thread.rig.mechanics.contact import Surface
-from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
-from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
-from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.rig.power import StageProcess
+from magnetosuture_thread.rig.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
@@ -203,7 +202,7 @@ class RigSettings(
         """Return the surfaces that needle and thread can touch; the hole of a shape is drawn but has no contact."""
         return Surface(
             discs=tuple(o for o in scene.obstacles if isinstance(o, Disc)),
-            polygons=tuple(o.rings[0] for o in scene.obstacles if isinstance(o, Polygon)),
+            polygons=tuple(o for o in scene.obstacles if isinstance(o, Polygon)),
             wall_radius=scene.dish.radius,
             friction=self.thread_friction,
             self_contact=scene.dish.has_self_contact(self.thread_diameter),

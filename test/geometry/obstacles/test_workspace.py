@@ -10,13 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.geometry.obstacles import (
-    WALL,
-    Disc,
-    Obstacle,
-    Polygon,
-    Workspace,
-)
+from magnetosuture_thread.geometry.obstacles import WALL, Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 
 RATE, SPEED, DRAG = 60.0, 1e-3, 0.5
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.rig.mechanics.needle import MU_0, CoilField, NeedleBody
+from magnetosuture_thread.rig.dynamics import MU_0, CoilField, NeedleBody
 
 
 def body(**changes: float) -> NeedleBody:
