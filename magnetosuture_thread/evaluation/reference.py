@@ -337,7 +337,7 @@ def run_case(
     vertices = np.array([initial, *(each.vertices for each in steps)])
     # The needle's own way is given, so only the thread's nodes can be blamed.
     nodes = vertices[1:, 1:].reshape(-1, 2)
-    gaps = [float(disc.signed_distance(nodes)[0].min()) - 0.5 * diameter for disc in reference.discs]
+    gaps = [float(np.hypot(*(nodes - disc.centre).T).min()) - disc.radius - 0.5 * diameter for disc in reference.discs]
     truth = np.stack([resampled(curve, len(initial) - 1) for curve in reference.threads])
     error = node_errors(vertices, truth[:, 1:], length).mean(axis=1)
     times = Percentiles.of(took)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.cdr import Stamp
 from magnetosuture_thread.bags.packing import Outputs, packed_path, packed_pose_stamped, packed_wrench
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import find_collision
+from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.rig.camera import Cover, DishCamera, Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings

@@ -337,7 +337,8 @@ def crossings(q: Vector) -> NDArray[np.bool_]:
         for k in range(segments + 1):
             side[i, k] = ex * (nodes[k, 1] - nodes[i, 1]) - ey * (nodes[k, 0] - nodes[i, 0])
     apart: NDArray[np.bool_] = side[:, :-1] * side[:, 1:] < 0.0
-    return np.logical_and(apart, apart.T)
+    crossed: NDArray[np.bool_] = np.logical_and(apart, apart.T)
+    return crossed
 
 
 @compiled

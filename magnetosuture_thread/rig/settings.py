@@ -13,8 +13,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import find_collision
+from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting, Look
 from magnetosuture_thread.rig.contact import Surface
 from magnetosuture_thread.rig.dynamics import CoilField, NeedleBody, RigDynamics

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_shapes import scene_from_mapping
+from magnetosuture_thread.geometry.scene_files import scene_from_mapping
 
 SECTOR = {"center": [0.0, -0.005], "inner_radius": 0.0077, "outer_radius": 0.0111, "start_angle": 3.5, "end_angle": 6.0}
 SQUARE = [[-0.004, 0.008], [0.004, 0.008], [0.0041, 0.014], [-0.004, 0.014]]

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.geometry.scene_checks import scene_warnings
-from magnetosuture_thread.geometry.scene_files import read_scene
-from magnetosuture_thread.geometry.scene_shapes import shape_from_mapping
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape, scene_warnings
+from magnetosuture_thread.geometry.scene_files import read_scene, shape_from_mapping
 
 WIDTH = 0.0004
 SQUARE = ((0.0, 0.0), (0.004, 0.0), (0.004, 0.004), (0.0, 0.004))

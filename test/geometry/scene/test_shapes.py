@@ -11,7 +11,7 @@ import shapely
 from scipy.integrate import quad
 
 from magnetosuture_thread.geometry.obstacles import Polygon
-from magnetosuture_thread.geometry.scene_shapes import ARC_TOLERANCE, shape_from_mapping
+from magnetosuture_thread.geometry.scene_files import ARC_TOLERANCE, shape_from_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 HALF_PI = 0.5 * math.pi
