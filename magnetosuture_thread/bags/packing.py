@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.bags.cdr import BEGIN, DISH_END, Stamp, aligned, pack
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
+from magnetosuture_thread.geometry.needle_arc import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.settings import interface

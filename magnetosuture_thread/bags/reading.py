@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.cdr import BEGIN, DISH_END, header_stamp, is_in_dish_frame
 from magnetosuture_thread.bags.packing import IN_PLANE, PATH_AT, PATH_GAP, PATH_POSES
-from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
+from magnetosuture_thread.geometry.needle_arc import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings import interface

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -62,7 +62,7 @@ class ThreadObservation:
 
     pieces: tuple[ThreadPiece, ...] = ()
     complete: bool = False
-    hidden: tuple[Points, ...] = field(default=())
+    hidden: tuple[Points, ...] = ()
 
     @property
     def from_tail(self) -> Points | None:

@@ -15,7 +15,7 @@ from magnetosuture_thread.bags.markers import forecast_events
 from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.estimator.disturbance import disturbance_text
-from magnetosuture_thread.geometry.orientation import heading_angle
+from magnetosuture_thread.geometry.needle_arc import heading_angle
 from magnetosuture_thread.settings.errors import shortened
 from magnetosuture_thread.thread.margins import node_clearance
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magnetosuture_thread.geometry.orientation import heading_angle, heading_from_quaternion, yaw_quaternion
+from magnetosuture_thread.geometry.needle_arc import heading_angle, heading_from_quaternion, yaw_quaternion
 from magnetosuture_thread.settings.errors import InvalidInputError
 
 
