@@ -1,4 +1,4 @@
-"""Settings of the simulated rig."""
+"""Settings of the simulated rig, and the faults that may be asked of it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,73 @@ from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene, find_collision
-from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting, Look
+from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting
 from magnetosuture_thread.rig.contact import Surface
 from magnetosuture_thread.rig.dynamics import CoilField, NeedleBody, RigDynamics
-from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.power import StageProcess
 from magnetosuture_thread.rig.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import quantity
-from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+
+COVERS = ("glare", "hand", "tool")
+KINDS = (*COVERS, "dim", "overexposed", "dropped_frames", "late_frames", "camera_stopped", "needle_out", "coil_stuck")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        kind: one of `KINDS`.
+        start: when it begins [s].
+        duration: how long it lasts [s].
+    """
+
+    kind: str
+    start: float
+    duration: float
+
+    @classmethod
+    def parse(cls, text: str) -> Fault:
+        """Read `KIND START DURATION`, in seconds.
+
+        >>> Fault.parse("glare 2 0.5")
+        Fault(kind='glare', start=2.0, duration=0.5)
+
+        Raises:
+            ConfigurationError: it is something else.
+        """
+        words = text.split()
+        try:
+            start, duration = (float(word) for word in words[1:])
+        except ValueError:
+            start = duration = float("nan")
+        if not words or words[0] not in KINDS or not (0.0 <= start < 1e6 and 0.0 < duration < 1e6):
+            expectation = f"KIND START DURATION in seconds, with a kind of {', '.join(KINDS)}"
+            raise ConfigurationError("rig_simulator.faults", repr(text), expectation)
+        return cls(words[0], start, duration)
+
+    @classmethod
+    def requested(cls, text: str, time: float) -> Fault:
+        """Read `KIND DURATION` as a fault that begins at a time [s].
+
+        >>> Fault.requested("glare 0.5", 7.0)
+        Fault(kind='glare', start=7.0, duration=0.5)
+
+        Raises:
+            InvalidInputError: it is something else.
+        """
+        kind, _, duration = text.partition(" ")
+        try:
+            return cls.parse(f"{kind} {time!r} {duration}")
+        except ConfigurationError:
+            expectation = f"KIND DURATION, with a kind of {', '.join(KINDS)}"
+            raise InvalidInputError("rig/fault", repr(text), expectation) from None
+
+    def holds(self, time: float) -> bool:
+        """Return whether the fault is in force at a time [s]."""
+        return self.start <= time < self.start + self.duration
 
 
 @dataclass(frozen=True)
@@ -134,29 +192,24 @@ class RigSettings(
             ConfigurationError: needle or thread would start in the wall or in a shape, or the looks are those of
                 another number of shapes, or the thread would start on itself where the scene does not allow it.
         """
-        count = len(scene.shapes)
-        if self.obstacle_looks and len(self.obstacle_looks) != count:
-            raise self.refused("obstacle_looks", f"one for each of the scene's {count} shapes, or none")
-        at = np.linspace(0.0, 1.0, 100)
-        turn = abs(self.thread_start_curvature) * self.thread_length
-        if turn >= 2.0 * math.pi and scene.dish.has_self_contact(self.thread_diameter):
-            most = 2.0 * math.pi / self.thread_length
+        if self.obstacle_looks and len(self.obstacle_looks) != len(scene.shapes):
+            raise self.refused("obstacle_looks", f"one for each of the scene's {len(scene.shapes)} shapes, or none")
+        at, most = np.linspace(0.0, 1.0, 100), 2.0 * math.pi / self.thread_length
+        if abs(self.thread_start_curvature) >= most and scene.dish.has_self_contact(self.thread_diameter):
             expected = f"less than {most:.4g} 1/m to either side: the thread would lie on itself"
             raise self.refused("thread_start_curvature", expected)
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
         for name, points in {"a needle": needle, "a thread": self.thread_at_start(at)}.items():
-            what = find_collision(scene, points, holes=False)
-            if what:
+            if what := find_collision(scene, points, holes=False):
                 start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
                 expectation = f"{name} in the dish, off the obstacles: it would be in {what}"
                 raise ConfigurationError(f"{self.GROUP}.needle_start", start, expectation)
 
     def thread_at_start(self, at: NDArray[np.float64]) -> Points:
         """Return points along the thread as it lies at the start, `at` from 0 to 1, shape (m, 2) [m]."""
-        x, y, heading = self.needle_start
-        tail = np.array([x, y])
-        return needle_axis(tail, heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]
+        *tail, heading = self.needle_start
+        return needle_axis(np.array(tail), heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]
 
     def view(self, scene: Scene) -> DishView:
         """Return where the dish is in the image: a little off the middle, as in a real rig."""
@@ -164,32 +217,13 @@ class RigSettings(
         return DishView((0.5 * self.camera_width + 2.0, 0.5 * self.camera_height - 2.0), scale)
 
     def camera(self, scene: Scene) -> DishCamera:
-        """Return the camera over the dish."""
-        seen = CameraScene(
-            dish_diameter=scene.dish.diameter,
-            needle_length=self.needle_length,
-            needle_width=self.needle_width,
-            needle_curvature=self.needle_curvature,
-            thread_diameter=self.thread_diameter,
-            obstacles=scene.obstacles,
-            looks=self._looks(scene),
-        )
+        """Return the camera over the dish; shapes look as `obstacle_looks` says of all of them, else by their kind."""
+        names = self.obstacle_looks if len(self.obstacle_looks) == len(scene.shapes) else ()
+        needle = self.needle_length, self.needle_width, self.needle_curvature
+        looks = tuple(LOOKS[name] for name in names or [LOOK_OF_KIND[shape.kind] for shape in scene.shapes])
+        seen = CameraScene(scene.dish.diameter, *needle, self.thread_diameter, obstacles=scene.obstacles, looks=looks)
         lighting = Lighting(gain=self.light_gain, noise=self.noise)
         return DishCamera(seen, self.view(scene), (self.camera_width, self.camera_height), self.seed, lighting)
-
-    def _looks(self, scene: Scene) -> tuple[Look, ...]:
-        """Return how each shape looks: as told, where that is told of all; else by its kind."""
-        told = self.obstacle_looks if len(self.obstacle_looks) == len(scene.shapes) else ()
-        return tuple(LOOKS[name] for name in told or [LOOK_OF_KIND[shape.kind] for shape in scene.shapes])
-
-    def schedule(self, scene: Scene) -> FaultSchedule:
-        """Return what goes wrong and when."""
-        faults = [Fault.parse(text) for text in self.faults]
-        return FaultSchedule(faults, scene.dish.diameter, self.needle_length, self.seed)
-
-    def field(self) -> CoilField:
-        """Return the coils' field."""
-        return CoilField(self.coil_angles, self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns)
 
     def power(self) -> StageProcess | None:
         """Return the simulated boards, None where currents come as messages."""
@@ -199,42 +233,25 @@ class RigSettings(
 
     def surface(self, scene: Scene) -> Surface:
         """Return the surfaces that needle and thread can touch; the hole of a shape is drawn but has no contact."""
-        return Surface(
-            discs=tuple(o for o in scene.obstacles if isinstance(o, Disc)),
-            polygons=tuple(o for o in scene.obstacles if isinstance(o, Polygon)),
-            wall_radius=scene.dish.radius,
-            friction=self.thread_friction,
-            self_contact=scene.dish.has_self_contact(self.thread_diameter),
-        )
+        discs = tuple(shape for shape in scene.obstacles if isinstance(shape, Disc))
+        polygons = tuple(shape for shape in scene.obstacles if isinstance(shape, Polygon))
+        touches = scene.dish.has_self_contact(self.thread_diameter)
+        return Surface(discs, polygons, scene.dish.radius, friction=self.thread_friction, self_contact=touches)
 
     def dynamics(self, scene: Scene) -> RigDynamics:
         """Return needle and thread at their start, in the field of the coils."""
         x, y, heading = self.needle_start
-        tail = np.array([x, y])
-        behind = self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1))
+        shape = self.needle_length, self.needle_width, self.needle_curvature
+        stiffness = self.thread_bending_stiffness, self.thread_stretching_stiffness
+        drag = self.thread_drag_across, self.thread_drag_along
+        joint, size = NeedleJoint(self.thread_attachment), (self.thread_length, self.thread_segments)
         return RigDynamics(
-            needle=NeedleBody(
-                length=self.needle_length,
-                diameter=self.needle_width,
-                curvature=self.needle_curvature,
-                magnetisation=self.needle_magnetisation,
-                viscosity=self.viscosity,
-            ),
-            thread=ThreadProperties(
-                length=self.thread_length,
-                segments=self.thread_segments,
-                bending_stiffness=self.thread_bending_stiffness,
-                stretching_stiffness=self.thread_stretching_stiffness,
-                drag_across=self.thread_drag_across,
-                drag_along=self.thread_drag_along,
-                attachment=NeedleJoint(self.thread_attachment),
-                diameter=self.thread_diameter,
-            ),
-            surface=self.surface(scene),
-            field=self.field(),
-            tail=tail,
-            heading=heading,
-            thread_points=behind,
-            # Twice the usual step costs half the time and is as exact to 0.01 % of the length.
-            largest_step=4e-3,
+            NeedleBody(*shape, self.needle_magnetisation, self.viscosity),
+            ThreadProperties(*size, *stiffness, *drag, joint, self.thread_diameter),
+            self.surface(scene),
+            CoilField(self.coil_angles, self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns),
+            (x, y),
+            heading,
+            self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1)),
+            largest_step=4e-3,  # s; twice the usual costs half the time and is as exact to 0.01 % of the length
         )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.rig.faults import KINDS, Fault, FaultSchedule
+from magnetosuture_thread.rig.rig import FaultSchedule
+from magnetosuture_thread.rig.settings import KINDS, Fault
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 TAIL, TIP = np.array([0.002, 0.001]), np.array([0.009, 0.001])
