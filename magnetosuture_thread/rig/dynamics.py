@@ -456,7 +456,7 @@ class RigDynamics:
     @property
     def tip(self) -> Vector:
         """The needle's tip, shape (2,) [m]."""
-        return self._tip_of(self._q)
+        return np.asarray(self._q[1:3] + self._turned(self._q, self._needle.tip))
 
     @property
     def body(self) -> Points:
@@ -510,11 +510,10 @@ class RigDynamics:
             SolverError: Newton's iteration did not converge, however small the step; the state is that of the last
                 step that did.
         """
-        amperes = np.asarray(currents, dtype=np.float64)
-        if not np.array_equal(amperes, self._held):
+        if not np.array_equal(currents, self._held):
             # Speeds jump with currents: a formula that looks back over the jump would lag by part of a step.
-            self._held, self._last_dt = amperes.copy(), 0.0
-        return self._integrate(dt, amperes, None, max_iterations)
+            self._held, self._last_dt = np.array(currents, dtype=np.float64), 0.0
+        return self._integrate(dt, self._held, None, max_iterations)
 
     def drive(self, tail: ArrayLike, heading: float, dt: float) -> None:
         """Move the needle at constant velocity and turn rate, and the thread with it.
@@ -579,7 +578,8 @@ class RigDynamics:
         trial = q + w * (q - before)
         flux = np.zeros((2, 2))
         if currents is not None and self.field is not None:
-            flux = np.array([self.field.per_current(at) @ currents for at in (trial[1:3], self._tip_of(trial))])
+            tip = trial[1:3] + self._turned(trial, needle.tip)
+            flux = np.array([self.field.per_current(at) @ currents for at in (trial[1:3], tip)])
         if pose is not None:
             trial[:3] = pose
         c, s = math.cos(trial[0]), math.sin(trial[0])
@@ -609,9 +609,6 @@ class RigDynamics:
         self._before, self._q, self._last_dt = q, trial, h
         self.time, self.residual, self.iterations = self.time + h, residual, self.iterations + iterations
         return True
-
-    def _tip_of(self, q: Vector) -> Vector:
-        return np.asarray(q[1:3] + self._turned(q, self._needle.tip))
 
     @staticmethod
     def _turned(q: Vector, vector: Vector) -> Vector:

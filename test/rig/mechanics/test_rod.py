@@ -83,11 +83,8 @@ def contact_term(shapes: Shapes) -> Term:
     return term
 
 
-def test_stretching_has_its_derivatives():
+def test_stretching_and_bending_have_their_derivatives():
     check_derivatives(lambda q, g, b, c: add_stretching(q, ROD, g, b, c), bent_state())
-
-
-def test_bending_has_its_derivatives():
     check_derivatives(lambda q, g, b, c: add_bending(q, ROD, g, b), bent_state(), 1e-7)
 
 
