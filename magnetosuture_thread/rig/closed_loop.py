@@ -173,7 +173,7 @@ class ClosedLoop:
         lost = self._random.uniform() < self._losses
         if not lost and (measured := self._measure(frame)) is not None:
             self._waiting = sorted([*self._waiting, measured], key=lambda waiting: waiting.due)
-        truth = frame.tail.copy(), frame.heading, frame.thread.copy(), float(self.rig.tension.max(initial=0.0))
+        truth = frame.tail.copy(), frame.heading, frame.thread.copy(), float(self.rig.dynamics.tension.max(initial=0.0))
         return LoopFrame(self.now - START, *truth, self._condition, self._commanded, self._reason)
 
     def _measure(self, frame: RigFrame) -> Measurement | None:

@@ -15,7 +15,7 @@ import struct
 import threading
 import time
 import tty
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from enum import IntEnum
@@ -331,13 +331,10 @@ class PowerStage:
     """
 
     def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
-        by_path: dict[str, list[RoboClawBoard]] = defaultdict(list)
-        self.boards = []
-        for path, address in zip(ports, board_addresses(len(ports)), strict=True):
-            board = RoboClawBoard(address, supply, resistance, inductance)
-            by_path[path].append(board)
-            self.boards.append(board)
-        self.lines = [Line(path, boards) for path, boards in by_path.items()]
+        coil = supply, resistance, inductance
+        self.boards = [RoboClawBoard(address, *coil) for address in board_addresses(len(ports))]
+        paths = list(zip(ports, self.boards, strict=True))
+        self.lines = [Line(path, [board for at, board in paths if at == path]) for path in dict.fromkeys(ports)]
 
     def open(self) -> None:
         """Let the boards be found.

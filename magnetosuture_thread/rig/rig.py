@@ -156,6 +156,7 @@ class Rig:
         currents: in force, shape (m,) [A].
         began: time of the first current that was not zero, inf before [s].
         problem: why everything stays where it is; empty if it does not.
+        dynamics: needle and thread.
         is_watched: whether the thread moves before the first current; a node waits for a model that follows it.
 
     Raises:
@@ -167,7 +168,7 @@ class Rig:
     ) -> None:
         settings.check_scene(scene)
         self._settings, self.scene = settings, scene
-        self._dynamics = settings.dynamics(scene)
+        self.dynamics = settings.dynamics(scene)
         self._camera: DishCamera | None = None  # drawn when it is needed first, which takes a second
         faults = [Fault.parse(text) for text in settings.faults]
         self.faults = FaultSchedule(faults, scene.dish.diameter, settings.needle_length, settings.seed)
@@ -205,11 +206,11 @@ class Rig:
             return
         # A thread around a post that stays may cut its edge by a chord, which is no reason to refuse.
         new = replace(scene, shapes=tuple(shape for shape in scene.shapes if shape not in self.scene.shapes))
-        for name, points in {"needle": self._dynamics.body, "thread": self._dynamics.thread}.items():
+        for name, points in {"needle": self.dynamics.body, "thread": self.dynamics.thread}.items():
             if what := find_collision(new, points, holes=False):
                 raise InvalidInputError("scene", f"{what} where the {name} is", "shapes off needle and thread")
         camera = None if self._camera is None else self._settings.camera(scene)
-        self._dynamics.set_surface(self._settings.surface(scene))
+        self.dynamics.set_surface(self._settings.surface(scene))
         self.scene, self._camera, self.faults.dish_diameter = scene, camera, scene.dish.diameter
 
     def apply(self, currents: Vector, time: float) -> None:
@@ -259,7 +260,7 @@ class Rig:
         try:
             if self.began == math.inf:  # what it has no time for is left out, as nothing else waits for the thread
                 if (span := min(time, limit) - self.time) > 0.0 and self.is_watched:
-                    self._dynamics.drive(self._dynamics.tail, self._dynamics.heading, span)
+                    self.dynamics.drive(self.dynamics.tail, self.dynamics.heading, span)
                 self.time = max(self.time, time)
                 return
             time = min(time, limit)
@@ -287,7 +288,7 @@ class Rig:
         # ROS times resolve 1 ns; what is nearer to the rig's own time waits for the next call.
         if span < 1e-9:
             return True
-        moved = self._dynamics.step(self.currents, span, self._max_iterations)
+        moved = self.dynamics.step(self.currents, span, self._max_iterations)
         self.time = time if moved >= span else self.time + moved
         return moved >= span
 
@@ -303,16 +304,6 @@ class Rig:
         text = "running" if self.running >= 0.0 else "the needle is held until the first current"
         return f"{text}, with {faults}" if faults else text
 
-    @property
-    def tension(self) -> Vector:
-        """Tension of each segment of the thread, shape (n,) [N]."""
-        return self._dynamics.tension
-
-    @property
-    def thread_pull(self) -> Vector:
-        """Force of the thread on the needle, at the tail, shape (2,) [N]."""
-        return self._dynamics.thread_pull
-
     def look(self, time: float, *, rendered: bool = True) -> RigFrame:
         """Take a frame at a time since the start [s].
 
@@ -321,7 +312,7 @@ class Rig:
             rendered: whether the picture is wanted too, which takes most of the time.
         """
         self.advance(time)
-        dynamics, running, chance = self._dynamics, self.running, float(self._random.uniform())
+        dynamics, running, chance = self.dynamics, self.running, float(self._random.uniform())
         kinds, away = self.faults.kinds(running), self.faults.lifted(running)
         tail, thread = dynamics.tail + away, dynamics.thread + away
         truth = tail, dynamics.heading, thread, dynamics.thread_pull, dynamics.thread_moment

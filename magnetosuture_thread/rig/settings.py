@@ -94,49 +94,33 @@ class RigSettings(
 
     GROUP: ClassVar[str] = "rig_simulator"
 
-    rate: float = quantity(
-        1.0, "how much faster than real time /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0
-    )
+    rate: float = quantity(1.0, "how much faster /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0)
     seed: int = quantity(0, "of dust, sensor noise and faults", minimum=0, maximum=2**31 - 1)
-    faults: tuple[str, ...] = quantity(
-        (), "what goes wrong: KIND START DURATION each, in seconds since the first current"
-    )
+    faults: tuple[str, ...] = quantity((), "what goes wrong: KIND START DURATION each, in s since the first current")
 
     obstacle_looks: tuple[str, ...] = quantity(
         (), f"of what each shape of the scene seems to be made, in order: {', '.join(LOOKS)}; none given: by its kind"
     )
 
-    coil_distance: float = quantity(
-        0.05, "from the dish's centre to the middle of a coil", unit="m", minimum=0.01, maximum=1.0
-    )
+    coil_distance: float = quantity(0.05, "of a coil's middle from the dish's", unit="m", minimum=0.01, maximum=1.0)
     coil_radius: float = quantity(0.025, "mean radius of the windings", unit="m", minimum=0.002, maximum=0.5)
     coil_length: float = quantity(0.03, "of the winding along its axis", unit="m", minimum=0.0, maximum=0.5)
     coil_turns: float = quantity(480.0, "of a coil", minimum=1.0, maximum=1e5)
-    coil_max_current: float = quantity(
-        30.0, "that the power stage gives, in either direction", unit="A", minimum=0.01, maximum=1000.0
-    )
+    coil_max_current: float = quantity(30.0, "of the power stage, either way", unit="A", minimum=0.01, maximum=1000.0)
 
     power_stage: str = quantity(
         "topic",
-        "where the currents come from: a topic, or simulated RoboClaw boards, which a driver finds at ports",
+        "where currents come from: a topic, or simulated RoboClaw boards at ports",
         choices=("topic", "roboclaw"),
     )
-    power_stage_ports: tuple[str, ...] = quantity(
-        (), "path at which each board is to be found, with two coils in a row; for power_stage roboclaw"
-    )
+    power_stage_ports: tuple[str, ...] = quantity((), "path of each board, with two coils in a row, for roboclaw")
     coil_resistance: float = quantity(1.0, "of a coil on a board", unit="ohm", minimum=0.01, maximum=1000.0)
     coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
     supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
 
-    needle_magnetisation: float = quantity(
-        1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
-    )
+    needle_magnetisation: float = quantity(1e6, "along its body, of NdFeB", unit="A/m", minimum=1e3, maximum=2e6)
     needle_start: tuple[float, ...] = quantity(
-        (0.003, -0.004, 0.0),
-        "x [m], y [m] of the tail and heading [rad] at the start",
-        minimum=-7.0,
-        maximum=7.0,
-        multiple=3,
+        (0.003, -0.004, 0.0), "x, y of the tail [m] and heading [rad] at first", minimum=-7.0, maximum=7.0, multiple=3
     )
 
     thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
@@ -149,10 +133,7 @@ class RigSettings(
     )
     thread_drag_along: float = quantity(0.487, "the same along it", unit="Pa s", minimum=1e-6, maximum=1e3)
     thread_friction: float = quantity(
-        0.0,
-        "coefficient of friction of the thread on shapes, wall and itself, whatever the scene says",
-        minimum=0.0,
-        maximum=2.0,
+        0.0, "coefficient of the thread on shapes, wall and itself, whatever the scene says", minimum=0.0, maximum=2.0
     )
     thread_start_curvature: float = quantity(
         0.0, "of the arc in which the thread lies behind the needle at the start", unit="1/m", minimum=-1e4, maximum=1e4

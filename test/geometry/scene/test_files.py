@@ -33,12 +33,10 @@ def test_a_written_scene_is_read_back_with_version_and_definitions(tmp_path: Pat
 @pytest.mark.parametrize("ending", [".yaml", ".geojson"])
 def test_geometry_without_a_definition_is_written_bit_for_bit(tmp_path: Path, ending: str):
     """As of a message: only the geometry is known."""
-    shapes = tuple(SceneShape(s.name, s.kind, s.geometry) for s in every_shape().shapes)
-    bare = Scene(Dish(0.05, 0.004, self_contact=True), shapes)
-    clockwise = Polygon(((0.0, -0.001), (0.0, -0.002), (1e-3 / 3.0, -0.002)), ())
-    bare = bare.add(SceneShape("clockwise", "wall", clockwise)).add(
-        SceneShape("tiny", "wall", Disc((-0.0, 1e-9), 1e-6))
-    )
+    shapes = [SceneShape(s.name, s.kind, s.geometry) for s in every_shape().shapes]
+    clockwise = Polygon(((0.0, -0.001), (0.0, -0.002), (1e-3 / 3.0, -0.002)))
+    others = SceneShape("clockwise", "wall", clockwise), SceneShape("tiny", "wall", Disc((-0.0, 1e-9), 1e-6))
+    bare = Scene(Dish(0.05, 0.004, self_contact=True), (*shapes, *others))
     write_scene(bare, tmp_path / f"bare{ending}")
     assert read_scene(str(tmp_path / f"bare{ending}")).version == bare.version
 
