@@ -141,9 +141,9 @@ class Barrier(ABC):
         if nodes.ndim != 2 or len(nodes) != count or nodes.shape[1] == 0 or nodes.dtype.kind not in "iu":
             shapes = f"values of shape {value.shape}, nodes of shape {nodes.shape} and type {nodes.dtype}"
             raise _refused(self, shapes, "shapes (m,) and (m, k), k >= 1, nodes integers")
-        wanted = (*nodes.shape, positions.shape[1])
-        if gradient.shape != wanted:
-            raise _refused(self, f"derivatives of shape {gradient.shape}", f"shape {wanted}")
+        shape = (*nodes.shape, positions.shape[1])
+        if gradient.shape != shape:
+            raise _refused(self, f"derivatives of shape {gradient.shape}", f"shape {shape}")
         if count and not (nodes.min() >= 0 and nodes.max() < len(positions)):
             raise _refused(self, f"nodes from {nodes.min()} to {nodes.max()}", f"nodes from 0 to {len(positions) - 1}")
         clearance = np.asarray(self.clearance(positions), dtype=np.float64)
@@ -254,7 +254,7 @@ def load_barriers(names: Sequence[str], parameter: str = "barriers") -> tuple[Ba
         parameter: what they are the value of, for errors.
 
     Raises:
-        ConfigurationError: a module cannot be imported or has no such class, or it is no barrier's.
+        ConfigurationError: a module cannot be imported or has no such class, or it is not that of a barrier.
     """
     barriers = []
     for name in names:

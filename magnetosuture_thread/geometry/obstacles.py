@@ -175,7 +175,7 @@ class Nearest(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Where points or chords are near obstacles or the wall: k rows, in the order of nodes, then obstacles.
+    """Contacts of points or chords with obstacles or the wall: k rows, in the order of nodes, then obstacles.
 
     Attributes:
         node: index of the point, or of the chord's first node, shape (k,).

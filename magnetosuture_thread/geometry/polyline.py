@@ -20,7 +20,7 @@ def as_numbers(name: str, value: Any) -> NDArray[np.float64]:
     """Return an array of a caller's numbers, itself where it is one.
 
     Raises:
-        InvalidInputError: they are no numbers, or rows of different lengths.
+        InvalidInputError: they are not numbers, or rows of different lengths.
     """
     try:
         return np.asarray(value, dtype=np.float64)
@@ -38,7 +38,7 @@ def finite_array(name: str, value: Any, shape: tuple[int | None, ...], limits: Q
         limits: of each number.
 
     Raises:
-        InvalidInputError: something is no number, not finite or out of the limits, or the shape is another.
+        InvalidInputError: something is not a number, not finite or out of the limits, or the shape is another.
     """
     array, words = as_numbers(name, value), str(shape).replace("None", "m")
     if array.ndim != len(shape) or any(size not in (None, got) for size, got in zip(shape, array.shape, strict=True)):

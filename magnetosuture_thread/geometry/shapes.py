@@ -71,7 +71,7 @@ class Polygon:
         holes: outlines of the holes, apart from the outline and from each other [m].
 
     Raises:
-        ConfigurationError: when it is no polygon: too few or not finite points, a crossing, a hole that
+        ConfigurationError: it is not a polygon: too few or not finite points, a crossing, a hole that
             is not inside, no area, or coordinates that cannot be metres.
     """
 

@@ -34,7 +34,7 @@ SHIFTS = 64  # px by which noise is shifted at the most, along rows and columns:
 
 @dataclass(frozen=True)
 class Look:
-    """How an obstacle looks. A tracker measures on green, so that soft tissue differs from the floor in the others.
+    """The look of an obstacle. A tracker measures on green, so that soft tissue differs from the floor in the others.
 
     Attributes:
         bgr: its colour, blue, green, red from 0 to 255.

@@ -94,7 +94,7 @@ def vary(setup: Setup, seed: int) -> Variation:
 
 @dataclass
 class RunFigures:
-    """What is measured of a run, all of it in the ground truth of the simulation but for the friction.
+    """The figures of a run, all of them in the ground truth of the simulation but for the friction.
 
     Attributes:
         time_s: from the start of the procedure to its end.
@@ -240,7 +240,7 @@ class RunExtremes:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run.
+    """The result of a run.
 
     Attributes:
         seed: of the run.

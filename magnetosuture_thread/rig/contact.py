@@ -1,4 +1,4 @@
-"""What the needle and the thread can touch: discs, polygons and the wall of the dish.
+"""Contacts of the needle and the thread: with discs, polygons and the wall of the dish.
 
 A contact is a gap g, at least 0 where nothing touches, and an energy k / 2 g^2 below: frictionless, stiff, and
 with an exact second derivative, from the gap's gradient and curvature.
@@ -62,7 +62,7 @@ class Shapes(NamedTuple):
 
 @dataclass(frozen=True)
 class Surface:
-    """What stands in the dish, and its wall.
+    """The surfaces of what stands in the dish, and its wall.
 
     Attributes:
         discs: round posts.

@@ -428,12 +428,9 @@ class RigDynamics:
         self._before, self._last_dt = self._q.copy(), 0.0
         self._largest_step = largest_step
         self._shapes = surface.packed()
-        stiffness, drag = (
-            (thread.stretching_stiffness, thread.bending_stiffness),
-            (thread.drag_across, thread.drag_along),
-        )
-        self._rod = Rod(length, *stiffness, *drag, 0.5 * thread.diameter + surface.skin)
-        clamp = thread.bending_stiffness / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
+        stretching, bending, reach = thread.stretching_stiffness, thread.bending_stiffness, 0.5 * thread.diameter
+        self._rod = Rod(length, stretching, bending, thread.drag_across, thread.drag_along, reach + surface.skin)
+        clamp = bending / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
         outline = needle.outline(min(int(2.0 * needle.length / needle.diameter) + 2, 48))
         radius = 0.5 * needle.diameter + surface.skin
         self._needle = Needle(needle.resistance, needle.tip, needle.pole, outline, radius, clamp)

@@ -1,4 +1,4 @@
-"""Whether the goals of a procedure were made, by the ground truth of a simulation.
+"""The goals of a procedure, judged by the ground truth of a simulation.
 
 Nothing here is shared with what plans and judges the goals in the nodes.
 """
@@ -195,7 +195,7 @@ class GoalTruth:
         share = np.linspace(0.0, 1.0, 4000, endpoint=False)
         sampled = [shapely.line_interpolate_point(ring, share, normalized=True) for ring in rings]
         distances = [shapely.distance(points, second) for points in sampled]
-        least, wanted, lines = np.min(distances), complex(*goal.direction) / abs(complex(*goal.direction)), []
+        least, direction, lines = np.min(distances), complex(*goal.direction) / abs(complex(*goal.direction)), []
         for points, distance in zip(sampled, distances, strict=True):
             near = distance <= 1.001 * least + 1e-7
             starts = np.flatnonzero(near & ~np.roll(near, 1)) if not near.all() else [0]
@@ -204,7 +204,7 @@ class GoalTruth:
                 middle = points[(start + count // 2) % len(near)]
                 (x, y), (u, v) = shapely.get_coordinates(shapely.shortest_line(middle, second))
                 begin, along = complex(x, y), complex(u - x, v - y)
-                part = (wanted / (1j * along / abs(along))).real
+                part = (direction / (1j * along / abs(along))).real
                 if abs(part) >= 0.5:
                     lines.append((begin, along) if part > 0.0 else (begin + along, -along))
         return lines

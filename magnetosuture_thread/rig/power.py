@@ -66,7 +66,7 @@ FACTORY_LIMITS = (3000, 3000)  # of the currents, in units of 10 mA
 
 
 class RoboClawBoard:
-    """What a board does with the packets for it, and what its coils do with the duties. Time comes in [s].
+    """A board: its answers to packets, and the currents that its duties give. Time comes in [s].
 
     A coil's current follows L di/dt = d U - R i, with the duty d from -1 to 1, the supply's voltage U, and
     resistance R and inductance L of the coil; the board takes back the duty of a coil at its current limit.
@@ -229,7 +229,7 @@ def answer(address: int, command: int, data: bytes) -> bytes:
 
 
 class Line:
-    """Serves boards on a pseudo-terminal, in a thread; the path is a symbolic link to it.
+    """Serves boards on a pseudo-terminal, by a worker; the path is a symbolic link to it.
 
     It stands in for hardware, and so, unlike the rest of the rig, it reads a clock and waits.
 
@@ -244,7 +244,7 @@ class Line:
     def __init__(self, path: str | Path, boards: Sequence[RoboClawBoard]) -> None:
         self.path, self.boards, self.lock = Path(path), tuple(boards), threading.Lock()
         self._ends = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._worker: threading.Thread | None = None
         self._host = self._device = -1
 
     def plug(self) -> None:
@@ -253,7 +253,7 @@ class Line:
         Raises:
             ConfigurationError: the path cannot be a symbolic link.
         """
-        if self._thread is not None:
+        if self._worker is not None:
             return
         self._host, self._device = os.openpty()
         # Held open here, so that the line does not hang up while nobody else has it.
@@ -271,16 +271,16 @@ class Line:
             expectation = f"a path for a symbolic link ({error.strerror})"
             raise ConfigurationError("rig_simulator.power_stage_ports", str(self.path), expectation) from None
         self._ends.clear()
-        self._thread = threading.Thread(target=self._serve, name=f"line {self.path}", daemon=True)
-        self._thread.start()
+        self._worker = threading.Thread(target=self._serve, name=f"line {self.path}", daemon=True)
+        self._worker.start()
 
     def unplug(self) -> None:
         """Remove the line; its boards keep their state. No effect if there is none."""
-        if self._thread is None:
+        if self._worker is None:
             return
         self._ends.set()
-        self._thread.join()
-        self._thread = None
+        self._worker.join()
+        self._worker = None
         with suppress(OSError):
             if os.readlink(self.path) == os.ttyname(self._device):  # else somebody else has put his own there
                 self.path.unlink()

@@ -299,7 +299,7 @@ class Rig:
 
     @property
     def status(self) -> str:
-        """What goes on, for a person."""
+        """The state in words, for a person."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
         text = "running" if self.running >= 0.0 else "the needle is held until the first current"
         return f"{text}, with {faults}" if faults else text
@@ -325,7 +325,7 @@ class Rig:
     def render(self, frame: RigFrame) -> RigFrame:
         """Return a frame with its picture, where it does not get lost.
 
-        It may be called in another thread than the rest, by one at a time.
+        It may be called by another worker than the rest, by one at a time.
         """
         if frame.lost:
             return frame
@@ -334,7 +334,7 @@ class Rig:
 
 
 def ground_truth_outputs(stamp: Stamp, frame: RigFrame) -> Outputs:
-    """Give where needle and thread of a simulation are, and how the thread pulls."""
+    """Yield the ground truth as messages: needle, thread, and how the thread pulls."""
     yield interface.GROUND_TRUTH_NEEDLE, packed_pose_stamped(stamp, frame.tail, frame.heading)
     yield interface.GROUND_TRUTH_THREAD, packed_path(stamp, frame.thread)
     yield interface.GROUND_TRUTH_PULL, packed_wrench(stamp, frame.pull, frame.moment)

@@ -42,7 +42,7 @@ NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
 
 
 class NeedleJoint(str, Enum):
-    """How the thread is tied to the needle's tail."""
+    """The joint of the thread and the needle's tail."""
 
     PINNED = "pinned"
     CLAMPED = "clamped"
@@ -94,7 +94,7 @@ class Rod(NamedTuple):
 
 
 class StepTerms(NamedTuple):
-    """What one step adds to the elastic energy, N = 2n + 3 unknowns.
+    """Terms that one step adds to the elastic energy, N = 2n + 3 unknowns.
 
     Attributes:
         begin: state at the start of the step, from which slip is measured, shape (N,) [rad, m].
