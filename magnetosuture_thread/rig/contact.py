@@ -148,7 +148,7 @@ def clear(x: float, y: float, reach: float, shapes: Shapes) -> bool:
 
 
 @compiled_inline
-def write_row(rows: Vector, count: int, a: float, s: float, depth: float, nx: float, ny: float, last: float) -> int:
+def write_row(rows: Vector, count: int, a: int, s: float, depth: float, nx: float, ny: float, last: float) -> int:
     """Write a row of six numbers, where there is room; return the new count."""
     if count >= rows.shape[0]:
         return count
@@ -240,7 +240,8 @@ def point_contacts(a: int, x: float, y: float, radius: float, shapes: Shapes, ro
         if gap >= radius:
             continue
         count = write_row(rows, count, a, -1.0, radius - gap, nx, ny, bend)
-        for corner, edge in ((last, 0), (nearest, 2)):  # the edge before, and the one behind
+        for k in range(2):  # the edge before, and the one behind
+            corner, edge = (last, 0) if k == 0 else (nearest, 2)
             nx, ny = shapes.normals[corner, edge], shapes.normals[corner, edge + 1]
             gap = nx * (x - shapes.corners[corner, 0]) + ny * (y - shapes.corners[corner, 1])
             if shapes.convex[corner] == 0.0 and gap < radius:
@@ -322,5 +323,5 @@ def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Sh
                 if 0.0 < s < 1.0:
                     count = write_row(rows, count, a, s, radius - gap, nx, ny, gap)
                 else:
-                    count = write_row(rows, count, a + 2.0 * s, -1.0, radius - gap, nx, ny, 1.0 / gap)
+                    count = write_row(rows, count, a if s == 0.0 else a + 2, -1.0, radius - gap, nx, ny, 1.0 / gap)
     return count

@@ -297,10 +297,10 @@ def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System
     energy += add_clamp(q, bodies.needle, rod.segment, g, band, convex)
     if not driven:
         return energy + add_needle(q, bodies, terms, system, convex)
-    g[:3] = 0.0
-    band[:3, :] = 0.0
-    band[:3, 0] = 1.0
     for i in range(3):
+        g[i] = 0.0
+        band[i, :] = 0.0
+        band[i, 0] = 1.0
         for j in range(3, min(i + WIDTH, q.shape[0])):
             band[j, j - i] = 0.0
     return energy

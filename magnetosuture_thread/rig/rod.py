@@ -329,15 +329,17 @@ def back_substitute(band: Vector, right: Vector) -> None:
 @compiled
 def crossings(q: Vector) -> NDArray[np.bool_]:
     """Return which segments cross each other, shape (n, n)."""
-    nodes = q[1:].copy().reshape(-1, 2)
-    segments = len(nodes) - 1
+    segments = q.shape[0] // 2 - 1
     side = np.empty((segments, segments + 1))  # of the line of each segment, on which each node is
     for i in range(segments):
-        ex, ey = nodes[i + 1, 0] - nodes[i, 0], nodes[i + 1, 1] - nodes[i, 1]
+        a = 2 * i + 1
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
         for k in range(segments + 1):
-            side[i, k] = ex * (nodes[k, 1] - nodes[i, 1]) - ey * (nodes[k, 0] - nodes[i, 0])
-    apart: NDArray[np.bool_] = side[:, :-1] * side[:, 1:] < 0.0
-    crossed: NDArray[np.bool_] = np.logical_and(apart, apart.T)
+            side[i, k] = ex * (q[2 * k + 2] - q[a + 1]) - ey * (q[2 * k + 1] - q[a])
+    crossed = np.zeros((segments, segments), np.bool_)
+    for i in range(segments):
+        for j in range(segments):
+            crossed[i, j] = side[i, j] * side[i, j + 1] < 0.0 and side[j, i] * side[j, i + 1] < 0.0
     return crossed
 
 
@@ -375,10 +377,11 @@ def find_pairs(q: Vector, rod: Rod, shapes: Shapes, crossed: NDArray[np.bool_], 
                 continue
             if count + 2 > rows.shape[0]:
                 return -1
-            nx, ny = nx / gap, ny / gap
-            count = write_row(rows, count, a, b, s, nx, ny, NORMAL)
+            nx, ny, segment = nx / gap, ny / gap, float(b)
+            count = write_row(rows, count, a, segment, s, nx, ny, NORMAL)
             if gap < diameter and shapes.friction > 0.0:
-                count = write_row(rows, count, a, b, s, -ny, nx, shapes.friction * shapes.stiffness * (diameter - gap))
+                limit = shapes.friction * shapes.stiffness * (diameter - gap)
+                count = write_row(rows, count, a, segment, s, -ny, nx, limit)
     return count
 
 
@@ -439,9 +442,13 @@ def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: V
         first_free: the first unknown; those before are known.
         step: corrected, shape (N,).
     """
-    rows = np.flatnonzero(second)
-    size = len(rows)
-    columns, force, matrix = np.zeros((size, len(step))), np.zeros(size), np.zeros((size, size))  # a band, full width
+    rows, size = np.empty(second.shape[0], np.int64), 0
+    for row in range(second.shape[0]):
+        if second[row] > 0.0:
+            rows[size] = row
+            size += 1
+    columns, force = np.zeros((size, step.shape[0])), np.zeros(size)
+    matrix = np.zeros((size, size))  # a band as wide as it is long
     for i in range(size):
         for r in range(6):
             at, weight = _place(pairs[rows[i]], r)
@@ -459,4 +466,5 @@ def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: V
     if size > 0 and factor(matrix):
         back_substitute(matrix, force)
         for i in range(size):
-            step -= force[i] * columns[i]
+            for at in range(step.shape[0]):
+                step[at] -= force[i] * columns[i, at]
