@@ -26,6 +26,7 @@ Box = tuple[slice, slice]
 OVERSAMPLING = 4
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
+LIGHT_BGR = (0.955, 0.985, 1.0)
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 REACH_PX = 24.0  # of shadows and blur around what moves
@@ -91,7 +92,6 @@ class Lighting:
     Attributes:
         gain: of the exposure; 1 is well exposed.
         slope: how much darker one corner is than the opposite one, in units of the usual.
-        tint_bgr: colour of the light.
         glare: strength of the lamp's reflections in the liquid, 0 for none.
         noise: standard deviation of the sensor's noise, in units of the usual.
         blur_px: the lens's, as the standard deviation of a Gaussian.
@@ -99,7 +99,6 @@ class Lighting:
 
     gain: float = 1.0
     slope: float = 1.0
-    tint_bgr: tuple[float, float, float] = (0.955, 0.985, 1.0)
     glare: float = 1.0
     noise: float = 1.0
     blur_px: float = 0.75
@@ -217,25 +216,25 @@ class DishCamera:
         lay(region, strand, 1.0, scene.thread_bgr)
         if near is not None:
             lay(region[inside], needle, 1.0, STEEL_BGR)
-            gleam = line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0)
-            lay(region[inside], gleam, 1.0, GLEAM_BGR)
+            lay(region[inside], line_covered(near, self._gleam(tail, heading), 1.0), 1.0, GLEAM_BGR)
 
     def _needle_outline(self, tail: Points, heading: float) -> Points:
         """Return the needle's outline in pixels: a body of one width, the last fifth tapering to a fine point."""
         at = np.concatenate([np.linspace(0.0, 0.8, 17), np.linspace(0.84, 1.0, 5)])
         half = 0.5 * self._scene.needle_width * np.interp(at, [0.8, 1.0], [1.0, 0.12])
-        points, along = needle_axis(tail, heading, self._scene.needle_length, self._scene.needle_curvature, at)
-        aside = half[:, None] * np.column_stack([-along[:, 1], along[:, 0]])
-        return self.view.to_pixels(np.vstack([points - aside, (points + aside)[::-1]]))
+        points, left = self._axis(tail, heading, at)
+        return self.view.to_pixels(np.vstack([points - half[:, None] * left, (points + half[:, None] * left)[::-1]]))
 
     def _gleam(self, tail: Points, heading: float) -> Points:
-        """Return the line along which the body reflects the lamp: on the side that faces it."""
-        scene = self._scene
-        at = np.linspace(0.07, 0.77, 15)
-        points, along = needle_axis(tail, heading, scene.needle_length, scene.needle_curvature, at)
-        aside = np.column_stack([-along[:, 1], along[:, 0]])
-        # Direction towards the lamp, in the dish frame.
-        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ (-0.5, 0.86))[:, None] * aside)
+        """Return the line along which the body reflects the lamp, in pixels: on the side that faces it."""
+        points, left = self._axis(tail, heading, np.linspace(0.07, 0.77, 15))
+        facing = np.tanh(2.0 * left @ (-0.5, 0.86))  # towards the lamp, in the dish frame
+        return self.view.to_pixels(points + 0.22 * self._scene.needle_width * facing[:, None] * left)
+
+    def _axis(self, tail: Points, heading: float, at: Points) -> tuple[Points, Points]:
+        """Return points of the needle's axis, and unit vectors to its left."""
+        points, along = needle_axis(tail, heading, self._scene.needle_length, self._scene.needle_curvature, at)
+        return points, np.column_stack([-along[:, 1], along[:, 0]])
 
     def _through_lens(self, light: Light) -> Light:
         return np.asarray(cv2.GaussianBlur(light, (0, 0), self._lighting.blur_px), dtype=np.float32)
@@ -287,7 +286,7 @@ class DishCamera:
         # The two edges of the rim, and the light between them; the inner one is where other frames of a dish have it.
         for beyond, spread, depth in ((0.199e-3, 0.21e-3, -145.0), (0.98e-3, 0.18e-3, -100.0), (0.6e-3, 0.15e-3, 22.0)):
             light += depth * np.exp(-(((away - radius - beyond) / spread) ** 2))
-        image = np.asarray(light[:, :, None] * np.asarray(lighting.tint_bgr, dtype=np.float32), dtype=np.float32)
+        image = np.asarray(light[:, :, None] * np.array(LIGHT_BGR, np.float32), dtype=np.float32)
         looks = scene.looks or [LOOKS["silicone"]] * len(scene.obstacles)
         for obstacle, look in zip(scene.obstacles, looks, strict=True):
             self._add_obstacle(image, obstacle, look)
