@@ -99,7 +99,7 @@ def _measure(setup: Setup, segments: int, duration: float) -> dict[str, Any]:
         is_frame, at = loop.step() is not None, loop.rig.look(loop.rig.time, rendered=False)
         begin = at.tail.copy() if begin is None else begin
         if is_frame and (true or (at.tail != begin).any()):  # from when the needle moves on
-            true[round(1e9 * (START + loop.rig.time))] = at.thread, loop.rig.thread_pull
+            true[round(1e9 * (START + loop.rig.time))] = at.thread, at.pull
     times, pulls, expected = [], [], []
     errors: dict[str, list[float]] = {"prediction": [], "estimate": []}
     for stamp in sorted(session.results.keys() & true.keys()):

@@ -33,8 +33,7 @@ from magnetosuture_thread.evaluation.hernia import (
     start_centreline,
 )
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, ThreadProperties
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.thread.rod import RodFormulation
 

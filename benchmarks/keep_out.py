@@ -31,7 +31,7 @@ from magnetosuture_thread.coils.settings import MAX_BLIND_DISTANCE, CoilBridgeSe
 from magnetosuture_thread.commands.command import make_log
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.geometry.scene_shapes import shape_from_mapping
+from magnetosuture_thread.geometry.scene_files import shape_from_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 TOLERANCE = 5e-6  # m; deeper is a violation

@@ -16,8 +16,7 @@ from benchmarks.report import figures_table
 from magnetosuture_thread import NeedlePose, SolverError, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.self_contact import SelfContact

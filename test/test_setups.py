@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import find_file, share_directory
@@ -37,8 +37,9 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     assert coils.needle_turning_drag == pytest.approx(body.drag[2], rel=0.02)
     thread_drag = rig.thread_drag_along * rig.thread_length
     assert coils.needle_drag == pytest.approx(body.drag[0] + thread_drag, rel=0.05)
-    coil = rig.field().per_current(np.zeros(2))[:, 0]
-    assert np.linalg.norm(coil) == pytest.approx(coils.field_per_current, rel=0.01)
+    field = rig.dynamics(setup.scene).field
+    assert field is not None
+    assert np.linalg.norm(field.per_current(np.zeros(2))[:, 0]) == pytest.approx(coils.field_per_current, rel=0.01)
 
 
 def test_bridge_planner_and_forecast_keep_the_same_clearance():

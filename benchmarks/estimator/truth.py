@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, lay_behind_needle, points_at
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 
@@ -104,7 +103,7 @@ def simulate(
         diameter=thread.diameter,
     )
     (tails, headings), moving = wander(seed, duration), np.array(flow)
-    wall = None if moving.any() else WALL_RADIUS
+    wall = math.inf if moving.any() else WALL_RADIUS
     unit = np.column_stack([np.cos(headings), np.sin(headings)])
     path = lay_behind_needle(tails[0], unit[0], 1.05 * LENGTH, WALL_RADIUS - 0.5 * thread.diameter - 1e-4)
     needle, surface = NeedleBody(2e-3, 4e-4, 0.0, 0.0, 1.0), Surface(posts, wall_radius=wall)
@@ -115,7 +114,7 @@ def simulate(
         rig.drive(tails[index] - drift, float(headings[index]), 1.0 / RATE)
         threads.append(rig.thread + drift)
     poses = tuple(NeedlePose(k / RATE, tails[k], unit[k]) for k in range(len(tails)))
-    return Run(thread, poses, np.array(threads), posts, wall or math.inf)
+    return Run(thread, poses, np.array(threads), posts, wall)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.geometry.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
-from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation

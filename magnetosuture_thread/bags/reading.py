@@ -13,8 +13,8 @@ import numpy as np
 from magnetosuture_thread.bags import packing
 from magnetosuture_thread.bags.packing import Vector
 from magnetosuture_thread.geometry import scene as scenes
+from magnetosuture_thread.geometry.needle_arc import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
-from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.shapes import Ring
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece

@@ -29,10 +29,10 @@ from magnetosuture_thread.coils.needle_motion import (
     needle_margin,
     no_rows,
 )
-from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.barrier import Barrier, check_barriers
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.obstacles import pack_obstacles
+from magnetosuture_thread.geometry.polyline import finite_array
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.configuration import Quantity

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from magnetosuture_thread import ConfigurationError, Disc, SceneShape, read_scene
 from magnetosuture_thread.commands import command
-from magnetosuture_thread.geometry.scene_checks import scene_warnings
+from magnetosuture_thread.geometry.scene import scene_warnings
 from magnetosuture_thread.settings.files import whole_file
 
 DESCRIPTION = """\
@@ -105,6 +105,6 @@ def _shape(shape: SceneShape) -> dict[str, Any]:
         "type": kind or ("disc" if isinstance(geometry, Disc) else "polygon"),
         "definition": dict(shape.definition),
         "bounds_m": bounds,
-        "area_m2": shape.area,
+        "area_m2": geometry.area,
         "vertices": vertices,
     }

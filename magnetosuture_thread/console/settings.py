@@ -49,8 +49,8 @@ class ConsoleSettings(shared.SceneName, shared.NeedleArc):
     def check(self) -> None:
         """Reject what does not fit.
 
-        A public page without a token, a key without a certificate, an origin that is not valid, a speed above the maximum,
-        and a short timeout.
+        A public page without a token, a key without a certificate, an origin that is not valid, a speed above the
+        maximum, and a short timeout.
         """
         is_token = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable() and " " not in self.token
         exposed = f"a token, as {self.address} can be reached from other machines"

@@ -27,7 +27,7 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_m
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.workers import Log, Progress
-from magnetosuture_thread.geometry.orientation import round_trip_heading
+from magnetosuture_thread.geometry.needle_arc import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation

@@ -22,8 +22,7 @@ from magnetosuture_thread.evaluation.metrics import RunMetrics, node_errors
 from magnetosuture_thread.evaluation.workers import Progress
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
@@ -317,7 +316,7 @@ def run_case(
     vertices = np.array([initial, *(figures.vertices for figures in steps)])
     # The needle's own way is given, so only the thread's nodes can be blamed.
     nodes = vertices[1:, 1:].reshape(-1, 2)
-    gaps = [float(disc.signed_distance(nodes)[0].min()) - 0.5 * diameter for disc in reference.discs]
+    gaps = [float(np.hypot(*(nodes - disc.centre).T).min()) - disc.radius - 0.5 * diameter for disc in reference.discs]
     truth = np.stack([resampled(curve, len(initial) - 1) for curve in reference.threads])
     error = node_errors(vertices, truth[:, 1:], length).mean(axis=1)
     median, p99 = np.percentile(times, (50, 99)).tolist()

@@ -26,12 +26,10 @@ from magnetosuture_thread.forecast.rollout import (
     nodes_under_friction,
     step_needle,
 )
-from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.compiled import TypedKernel
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
-from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import WALL_NAME
+from magnetosuture_thread.geometry.polyline import Points, as_numbers, chain_inside, finite_array, lay_behind_needle
+from magnetosuture_thread.geometry.scene import WALL_NAME, Scene
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import FrictionLaw

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, as_numbers, finite_array
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, shortened
 
@@ -141,21 +140,23 @@ class Barrier(ABC):
         count = len(value) if value.ndim == 1 else -1
         if nodes.ndim != 2 or len(nodes) != count or nodes.shape[1] == 0 or nodes.dtype.kind not in "iu":
             shapes = f"values of shape {value.shape}, nodes of shape {nodes.shape} and type {nodes.dtype}"
-            raise InvalidInputError(f"barrier {self.name}", shapes, "shapes (m,) and (m, k), k >= 1, nodes integers")
-        if gradient.shape != (*nodes.shape, positions.shape[1]):
-            wanted = f"shape {(*nodes.shape, positions.shape[1])}"
-            raise InvalidInputError(f"barrier {self.name}", f"derivatives of shape {gradient.shape}", wanted)
+            raise _refused(self, shapes, "shapes (m,) and (m, k), k >= 1, nodes integers")
+        shape = (*nodes.shape, positions.shape[1])
+        if gradient.shape != shape:
+            raise _refused(self, f"derivatives of shape {gradient.shape}", f"shape {shape}")
         if count and not (nodes.min() >= 0 and nodes.max() < len(positions)):
-            found = f"nodes from {nodes.min()} to {nodes.max()}"
-            raise InvalidInputError(f"barrier {self.name}", found, f"nodes from 0 to {len(positions) - 1}")
+            raise _refused(self, f"nodes from {nodes.min()} to {nodes.max()}", f"nodes from 0 to {len(positions) - 1}")
         clearance = np.asarray(self.clearance(positions), dtype=np.float64)
         if clearance.shape != value.shape:
-            found = f"clearances of shape {clearance.shape}"
-            raise InvalidInputError(f"barrier {self.name}", found, f"shape {value.shape}")
-        if not (np.isfinite(value).all() and np.isfinite(gradient).all() and np.isfinite(clearance).all()):
-            raise InvalidInputError(f"barrier {self.name}", "a number that is not finite", "finite numbers")
+            raise _refused(self, f"clearances of shape {clearance.shape}", f"shape {value.shape}")
+        if not all(np.isfinite(numbers).all() for numbers in (value, gradient, clearance)):
+            raise _refused(self, "a number that is not finite", "finite numbers")
         obstacle = np.full(count, NO_OBSTACLE, dtype=np.intp)
         return BarrierRows(self.name, nodes.astype(np.intp), obstacle, value, gradient.astype(np.float64), clearance)
+
+
+def _refused(barrier: Barrier, value: str, expectation: str) -> InvalidInputError:
+    return InvalidInputError(f"barrier {barrier.name}", value, expectation)
 
 
 def check_gradient(barrier: Barrier, positions: Points, tolerance: float = 1e-4) -> float:
@@ -173,26 +174,25 @@ def check_gradient(barrier: Barrier, positions: Points, tolerance: float = 1e-4)
         InvalidInputError: a derivative is another, with row, node and axis; the number of rows changes close by; or
             what the barrier returns does not fit together, see `Barrier.rows`.
     """
-    positions = as_numbers("positions", positions)
-    positions = finite_array(
-        "positions", positions, (None, 3 if positions.shape[-1:] == (3,) else 2), Quantity("", "m")
-    )
+    dimension = 3 if as_numbers("positions", positions).shape[-1:] == (3,) else 2
+    positions = finite_array("positions", positions, (None, dimension), Quantity("", "m"))
     # A millionth of the extent: a difference loses as much by rounding as by the curvature.
     rows, step = barrier.rows(positions), 1e-6 * float(np.ptp(positions, axis=0).max())
-    given, found = np.zeros((2, len(rows.value), *positions.shape))
-    np.add.at(given, (np.arange(len(given))[:, None], rows.nodes), rows.gradient)
+    stated, measured = np.zeros((2, len(rows.value), *positions.shape))
+    np.add.at(stated, (np.arange(len(stated))[:, None], rows.nodes), rows.gradient)
     for node, axis in np.ndindex(positions.shape):
         moved = np.zeros(positions.shape)
         moved[node, axis] = step
         ahead, behind = (barrier.rows(place).value for place in (positions + moved, positions - moved))
         if not ahead.shape == behind.shape == rows.value.shape:
-            raise InvalidInputError(f"barrier {barrier.name}", "another number of rows close by", "the same")
-        found[:, node, axis] = (ahead - behind) / (2.0 * step)
-    error = np.abs(given - found) / max(float(np.abs([given, found]).max(initial=0.0)), np.finfo(float).tiny)
+            raise _refused(barrier, "another number of rows close by", "the same")
+        measured[:, node, axis] = (ahead - behind) / (2.0 * step)
+    error = np.abs(stated - measured)
+    error /= max(float(np.abs([stated, measured]).max(initial=0.0)), np.finfo(float).tiny)
     if error.max(initial=0.0) > tolerance:
         row, node, axis = np.unravel_index(int(error.argmax()), error.shape)
-        what = f"derivative {given[row, node, axis]:g} of row {row} by node {node}, axis {axis}"
-        raise InvalidInputError(f"barrier {barrier.name}", what, f"{found[row, node, axis]:g}, as the values change")
+        problem = f"derivative {stated[row, node, axis]:g} of row {row} by node {node}, axis {axis}"
+        raise _refused(barrier, problem, f"{measured[row, node, axis]:g}, as the values change")
     return float(error.max(initial=0.0))
 
 
@@ -221,7 +221,7 @@ def check_barriers(barriers: tuple[Barrier, ...]) -> None:
     """Refuse barriers that share a name.
 
     Raises:
-        ConfigurationError: something is no barrier, or a name is missing, taken, or longer than `MAX_NAME_CHARS`.
+        ConfigurationError: something is not a barrier, or a name is missing, taken, or longer than `MAX_NAME_CHARS`.
     """
     if len(barriers) > MAX_BARRIERS:
         raise ConfigurationError("barriers", f"{len(barriers)} barriers", f"at most {MAX_BARRIERS}")
@@ -254,7 +254,7 @@ def load_barriers(names: Sequence[str], parameter: str = "barriers") -> tuple[Ba
         parameter: what they are the value of, for errors.
 
     Raises:
-        ConfigurationError: a module cannot be imported or has no such class, or it is no barrier's.
+        ConfigurationError: a module cannot be imported or has no such class, or it is not that of a barrier.
     """
     barriers = []
     for name in names:
@@ -262,11 +262,11 @@ def load_barriers(names: Sequence[str], parameter: str = "barriers") -> tuple[Ba
         if not (colon and module and attribute.isidentifier()):
             raise ConfigurationError(parameter, name, "module:class, as in my_package.barriers:KeepIn")
         try:
-            found = getattr(import_module(module), attribute)
+            kind = getattr(import_module(module), attribute)
             # Nothing else is called: a setup may come with a bag of somebody else.
-            if not (isinstance(found, type) and issubclass(found, Barrier)):
+            if not (isinstance(kind, type) and issubclass(kind, Barrier)):
                 raise ConfigurationError(parameter, name, "a subclass of magnetosuture_thread.Barrier")
-            barriers.append(found())
+            barriers.append(kind())
         except ConfigurationError:
             raise
         except Exception as error:  # whatever a user's module raises, its name has to be reported

@@ -17,7 +17,7 @@ from magnetosuture_thread.geometry.polyline import Points
 
 @dataclass(frozen=True)
 class DishView:
-    """Where the dish is in the image.
+    """The place of the dish in the image.
 
         u = u_0 + (x cos r - y sin r) / s,    v = v_0 - (x sin r + y cos r) / s
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event
@@ -20,15 +20,8 @@ PACKAGE = Path(__file__).parents[1]
 _IMPORT = re.compile(rb"^\s*from magnetosuture_thread\.([\w.]+) import (?=\(?([\w\s,]+))", re.MULTILINE)
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-_EVENTS = cast(Any, event)  # without types
-_COMPILATIONS = _EVENTS.RecordingListener()
-_EVENTS.register("numba:compile", _COMPILATIONS)
-
-
-class _Decorator(Protocol):
-    def __call__(self, function: _Function, /) -> _Function: ...
+_COMPILATIONS = cast(Any, event).RecordingListener()
+cast(Any, event).register("numba:compile", _COMPILATIONS)
 
 
 @cache
@@ -55,7 +48,7 @@ def source_digest(path: Path, package: Path = PACKAGE) -> str:
     return hashlib.sha256(b"".join(_read(file, package)[0] for file in sorted(reached))).hexdigest()
 
 
-def _decorator(*, keeps: bool = False, **options: Any) -> _Decorator:
+def _decorator(*, keeps: bool = False, **options: Any) -> Callable[[_Function], _Function]:
     """Return numba's decorator with numpy's rules for division by zero and, but for what is inlined, a cache.
 
     Options are said of every function, as numba takes them over from whatever calls one first where they are not.

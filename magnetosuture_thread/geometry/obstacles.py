@@ -20,20 +20,7 @@ from magnetosuture_thread.geometry.shapes import MIN_EXTENT, Disc, Obstacle, Pol
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
-__all__ = [
-    "MAX_FRICTION",
-    "WALL",
-    "Contacts",
-    "Disc",
-    "Obstacle",
-    "Polygon",
-    "Workspace",
-    "WorkspaceData",
-    "find_contacts",
-    "half_segment_distances",
-    "triangulate",
-    "wall_contact",
-]
+__all__ = ["Disc", "Obstacle", "Polygon", "triangulate"]
 
 Vector = NDArray[np.float64]
 
@@ -116,12 +103,11 @@ def pack_obstacles(
         reach: greatest distance of a contact; at least MIN_DISTANCE is taken [m].
         friction: coefficients of the wall, then of each obstacle; none for no friction.
     """
-    discs = [k for k, obstacle in enumerate(obstacles) if isinstance(obstacle, Disc)]
-    polygons = [k for k, obstacle in enumerate(obstacles) if isinstance(obstacle, Polygon)]
-    balls = [(shape.centre, shape.radius) for shape in obstacles if isinstance(shape, Disc)]
+    shapes = np.array(sorted(range(len(obstacles)), key=lambda k: isinstance(obstacles[k], Polygon)), dtype=np.int64)
+    discs = [shape for shape in obstacles if isinstance(shape, Disc)]
+    balls = [(*disc.centre[:2], disc.radius, *disc.centre[2:], 0.0)[:4] for disc in discs]
     tables = [edges_of(shape) for shape in obstacles if isinstance(shape, Polygon)]
-    circles, ranges, blocks = [np.empty((0, 3))], [np.empty((0, 2), np.int64)], [0]
-    edges = 0
+    circles, ranges, blocks, edges = [np.empty((0, 3))], [np.empty((0, 2), np.int64)], [0], 0
     for table in tables:
         first = np.arange(0, len(table), BLOCK)
         low = np.minimum.reduceat(np.minimum(table[:, 0:2], table[:, 2:4]), first)
@@ -132,11 +118,10 @@ def pack_obstacles(
         ranges.append(np.column_stack([edges + first, np.minimum(BLOCK, len(table) - first)]))
         blocks.append(blocks[-1] + len(first))
         edges += len(table)
-    shapes = np.array([*discs, *polygons], dtype=np.int64)
     return WorkspaceData(
         max(float(reach), MIN_DISTANCE),
         float(wall_radius),
-        np.array([(*centre[:2], radius, *centre[2:], 0.0)[:4] for centre, radius in balls]).reshape(-1, 4),
+        np.array(balls).reshape(-1, 4),
         np.array([*pairwise(blocks)], dtype=np.int64).reshape(-1, 2),
         np.array([[*table[:, :2].min(axis=0), *table[:, :2].max(axis=0)] for table in tables]).reshape(-1, 4),
         shapes,
@@ -190,7 +175,7 @@ class Nearest(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Where points or chords are near obstacles or the wall: k rows, in the order of nodes, then obstacles.
+    """Contacts of points or chords with obstacles or the wall: k rows, in the order of nodes, then obstacles.
 
     Attributes:
         node: index of the point, or of the chord's first node, shape (k,).
@@ -543,16 +528,19 @@ class Workspace:
     ) -> None:
         self.shapes, self.reach, self.dimension, self.wall_radius = tuple(shapes), reach, dimension, wall_radius
         for i, shape in enumerate(self.shapes):
-            _check(f"workspace.shapes[{i}]", shape, dimension)
+            name, centre = f"workspace.shapes[{i}]", shape.centre if isinstance(shape, Disc) else ()
+            if centre and len(centre) != dimension:
+                raise ConfigurationError(f"{name}.centre", centre, f"{dimension} coordinates [m]")
+            if not centre and dimension != 2:
+                raise ConfigurationError(name, "a polygon", "a disc with three coordinates, which is a ball, in space")
         self.friction, self.wall_friction = tuple(friction) or (0.0,) * len(self.shapes), wall_friction
         if len(self.friction) != len(self.shapes):
             expected = f"one for each of {len(self.shapes)} shapes"
             raise ConfigurationError("workspace.friction", f"{len(self.friction)} values", expected)
-        if dimension != 2 and max(wall_friction, *self.friction, 0.0) > 0.0:
-            raise ConfigurationError(
-                "workspace.friction", (wall_friction, *self.friction), "0 in space: friction is of the plane"
-            )
-        self.data = pack_obstacles(self.shapes, wall_radius, reach, (wall_friction, *self.friction))
+        coefficients = (wall_friction, *self.friction)
+        if dimension != 2 and max(coefficients) > 0.0:
+            raise ConfigurationError("workspace.friction", coefficients, "0 in space: friction is of the plane")
+        self.data = pack_obstacles(self.shapes, wall_radius, reach, coefficients)
 
     def near(self, points: Points) -> Contacts:
         """Return the contacts of points: every local minimum of the distance to an obstacle's boundary.
@@ -584,14 +572,6 @@ class Workspace:
             contacts = Contacts.room(room, self.dimension)
             count = find_contacts(points, self.data, contacts)
         return Contacts(*(array[:count].copy() for array in contacts))
-
-
-def _check(name: str, shape: Obstacle, dimension: int) -> None:
-    if isinstance(shape, Disc):
-        if len(shape.centre) != dimension:
-            raise ConfigurationError(f"{name}.centre", shape.centre, f"{dimension} coordinates [m]")
-    elif dimension != 2:
-        raise ConfigurationError(name, "a polygon", "a disc with three coordinates, which is a ball, in space")
 
 
 TOLERANCE = 1e-7

@@ -1,15 +1,55 @@
-"""Polylines: open chains of vertices, an array of shape (m, d)."""
+"""Polylines, which are open chains of vertices, an array of shape (m, d); and the check of arrays from callers."""
 
 from __future__ import annotations
 
 import cmath
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.errors import InvalidInputError, shortened
+
 Points = NDArray[np.float64]
 MIN_TURN_RATIO = 0.3  # of the radius of a circle that a polyline turns in
+
+
+def as_numbers(name: str, value: Any) -> NDArray[np.float64]:
+    """Return an array of a caller's numbers, itself where it is one.
+
+    Raises:
+        InvalidInputError: they are not numbers, or rows of different lengths.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidInputError(name, shortened(repr(value)), "an array of numbers") from None
+
+
+def finite_array(name: str, value: Any, shape: tuple[int | None, ...], limits: Quantity) -> NDArray[np.float64]:
+    """Return an array of a caller's numbers that has a shape and is within limits.
+
+    Args:
+        name: of the array, for the error.
+        value: to check.
+        shape: that it must have; None for any length.
+        limits: of each number.
+
+    Raises:
+        InvalidInputError: something is not a number, not finite or out of the limits, or the shape is another.
+    """
+    array, words = as_numbers(name, value), str(shape).replace("None", "m")
+    if array.ndim != len(shape) or any(size not in (None, got) for size, got in zip(shape, array.shape, strict=True)):
+        raise InvalidInputError(name, f"shape {array.shape}", f"shape {words}")
+    # Of a few numbers numpy takes longer to find the greatest.
+    few = array.shape in ((2,), (3,))
+    extremes = array.tolist() if few else [float(array.min(initial=0.0)), float(array.max(initial=0.0))]
+    if not all(map(limits.within, extremes)):
+        expected = limits.expectation(tuple, extremes).replace("a list", "numbers")
+        raise InvalidInputError(name, extremes, f"finite {expected}, in shape {words}")
+    return array
 
 
 def arc_lengths(points: Points) -> NDArray[np.float64]:
@@ -64,8 +104,10 @@ def chain_along(points: Points, segments: int, segment_length: float) -> Points:
         centre = chain[index - 1]
         while float(np.linalg.norm(path[edge + 1] - centre)) < segment_length:
             edge += 1
-        start = centre if edge == on_edge else path[edge]
-        chain[index] = _leave_ball(start, path[edge + 1], centre, segment_length)
+        start = centre if edge == on_edge else path[edge]  # inside of the circle, and the edge's end is outside
+        along, offset = path[edge + 1] - start, start - centre
+        a, b, c = float(along @ along), float(along @ offset), float(offset @ offset) - segment_length * segment_length
+        chain[index] = start + along * ((-b + np.sqrt(max(b * b - a * c, 0.0))) / a)
         on_edge = edge
     return chain
 
@@ -144,13 +186,3 @@ def _along_circle(centre: Points, step: Points, length: float, radius: float) ->
     cosine = min(max((away * away + length * length - radius * radius) / (2.0 * away * length), -1.0), 1.0)
     aside = float(np.sqrt(1.0 - cosine * cosine)) * np.array([-inward[1], inward[0]])
     return np.asarray(length * (cosine * inward + (aside if float(aside @ step) >= 0.0 else -aside)))
-
-
-def _leave_ball(inside: Points, outside: Points, centre: Points, radius: float) -> Points:
-    """Return where the line from a point inside of a ball to one outside leaves it."""
-    along = outside - inside
-    offset = inside - centre
-    a = float(along @ along)
-    b = float(along @ offset)
-    c = float(offset @ offset) - radius * radius
-    return np.asarray(inside + along * ((-b + np.sqrt(max(b * b - a * c, 0.0))) / a))

@@ -1,4 +1,4 @@
-"""A scene: one dish with named shapes, identified by the hash of its content."""
+"""A scene: one dish with named shapes, identified by the hash of its content; collisions, and warnings."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import hashlib
 import math
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Annotated, Any
 
 import numpy as np
 import shapely
 
-from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import MAX_FRICTION
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.shapes import Disc, Polygon
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
@@ -28,8 +31,8 @@ MAX_OUTLINES = 40  # the same, holes included
 MIN_EDGE = 2e-6  # m; a 30th of the thinnest thread, and what arcs and contacts may be off
 MAX_NAME_CHARS = 64
 MAX_COORDINATE = 1.0  # m; anything larger is in another unit
-MIN_RADIUS = 1e-6  # m
 VERSION_CHARS = 16
+WALL_NAME = "wall"  # in place of that of a shape
 
 
 def is_number(value: Any) -> bool:
@@ -40,11 +43,6 @@ def is_number(value: Any) -> bool:
         return math.isfinite(value)
     except OverflowError:  # a whole number beyond any float
         return False
-
-
-def _check_friction(name: str, value: Any) -> None:
-    if not (is_number(value) and 0.0 <= value <= MAX_FRICTION):
-        raise ConfigurationError(name, value, f"a coefficient of friction from 0 to {MAX_FRICTION:g}")
 
 
 @checked_arguments("dish")
@@ -116,7 +114,9 @@ class SceneShape:
             raise ConfigurationError("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
         if self.kind not in KINDS:
             raise ConfigurationError(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
-        _check_friction(f"{self.name}.friction", self.friction)
+        if not (is_number(self.friction) and 0.0 <= self.friction <= MAX_FRICTION):
+            expectation = f"a coefficient of friction from 0 to {MAX_FRICTION:g}"
+            raise ConfigurationError(f"{self.name}.friction", self.friction, expectation)
         if isinstance(self.geometry, Disc):
             if len(self.geometry.centre) != 2:
                 raise ConfigurationError(f"{self.name}.disc.centre", self.geometry.centre, "two coordinates x, y [m]")
@@ -130,28 +130,16 @@ class SceneShape:
             raise ConfigurationError(f"{self.name}.polygon", shortest, f"edges of at least {MIN_EDGE:g} m")
 
     @cached_property
-    def solid(self) -> shapely.Geometry:
+    def solid(self) -> shapely.Polygon:
         """The shape as a shapely geometry; a disc as a polygon of 256 vertices."""
-        if isinstance(self.geometry, Disc):
-            return shapely.Point(self.geometry.centre).buffer(self.geometry.radius, quad_segs=64)
-        outline, *holes = self.geometry.rings
-        return shapely.Polygon(outline, holes)
-
-    @property
-    def area(self) -> float:
-        """Area, holes taken off [m^2]."""
-        if isinstance(self.geometry, Disc):
-            return math.pi * self.geometry.radius**2
-        return self.geometry.area
+        return self.geometry.solid
 
     @cached_property
     def label_point(self) -> tuple[float, float]:
         """A point inside of the shape, well away from its boundary: where its name can stand [m]."""
         if isinstance(self.geometry, Disc):
             return self.geometry.centre[0], self.geometry.centre[1]
-        solid = self.solid
-        line = shapely.maximum_inscribed_circle(solid, tolerance=0.02 * math.sqrt(solid.area))
-        x, y = line.coords[0]
+        x, y = shapely.maximum_inscribed_circle(self.solid, tolerance=0.02 * math.sqrt(self.solid.area)).coords[0]
         return float(x), float(y)
 
     def outlines(self, tolerance: float) -> list[list[tuple[float, float]]]:
@@ -186,27 +174,22 @@ class Scene:
             raise ConfigurationError("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
         polygons = [shape.geometry for shape in self.shapes if isinstance(shape.geometry, Polygon)]
         rings = [ring for polygon in polygons for ring in (polygon.outline, *polygon.holes)]
-        for count, what, most in (
-            (len(rings), "outlines and holes", MAX_OUTLINES),
-            (sum(map(len, rings)), "vertices", MAX_VERTICES),
-        ):
-            if count > most:
-                raise ConfigurationError("shapes", f"{count} {what}", f"at most {most} in all")
+        if len(rings) > MAX_OUTLINES:
+            raise ConfigurationError("shapes", f"{len(rings)} outlines and holes", f"at most {MAX_OUTLINES} in all")
+        if (vertices := sum(map(len, rings))) > MAX_VERTICES:
+            raise ConfigurationError("shapes", f"{vertices} vertices", f"at most {MAX_VERTICES} in all")
         names = Counter(shape.name for shape in self.shapes)
         for shape in self.shapes:
             if names[shape.name] > 1:
                 raise ConfigurationError(shape.name, "a name given twice", "a name of its own for each shape")
-            near, far = _distance_and_coverage(shape, self.dish.radius)
+            near, covers = _distance_and_coverage(shape, self.dish.radius)
             if near >= self.dish.radius:
-                raise ConfigurationError(
-                    shape.name,
-                    f"a shape outside of the dish, {near:.4g} m from its centre",
-                    f"a part of it within the dish, less than {self.dish.radius:g} m",
-                )
-            if not far:
-                raise ConfigurationError(
-                    shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres"
-                )
+                problem = f"a shape outside of the dish, {near:.4g} m from its centre"
+                expectation = f"a part of it within the dish, less than {self.dish.radius:g} m"
+                raise ConfigurationError(shape.name, problem, expectation)
+            if covers:
+                problem = "a shape that covers the whole dish"
+                raise ConfigurationError(shape.name, problem, "room in the dish; lengths in metres")
 
     @classmethod
     @checked_arguments("scene")
@@ -298,12 +281,109 @@ def is_name(text: Any) -> bool:
 
 
 def _distance_and_coverage(shape: SceneShape, dish_radius: float) -> tuple[float, bool]:
-    """Return a shape's distance from the dish's centre [m], and whether it leaves any of the dish uncovered."""
+    """Return a shape's distance from the dish's centre [m], and whether it covers all of the dish."""
     geometry, solid = shape.geometry, shape.solid
     if isinstance(geometry, Disc):
         away = math.hypot(*geometry.centre)
-        return max(0.0, away - geometry.radius), away + dish_radius > geometry.radius
+        return max(0.0, away - geometry.radius), away + dish_radius <= geometry.radius
     near = float(solid.distance(shapely.Point(0.0, 0.0)))
-    if near > 0.0:
-        return near, True
-    return near, not solid.covers(shapely.Point(0.0, 0.0).buffer(dish_radius, quad_segs=32))
+    return near, near == 0.0 and solid.covers(shapely.Point(0.0, 0.0).buffer(dish_radius, quad_segs=32))
+
+
+def find_collision(scene: Scene, points: Points, depth: float = 0.0, *, holes: bool = True) -> str:
+    """Return the name of what a line through points collides with: `wall`, a shape, or empty for nothing.
+
+    It collides with the wall at or beyond it.
+
+    Args:
+        scene: dish and shapes.
+        points: of the line; of a point alone, shape (1, 2); shape (m, 2) [m].
+        depth: by which it may lie in the wall or a shape [m].
+        holes: whether the holes of a shape are open; else they are taken for part of it.
+    """
+    if (np.linalg.norm(points, axis=1) >= scene.dish.radius + depth).any():
+        return WALL_NAME
+    line = shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
+    for shape in scene.shapes:
+        solid = shape.solid if holes else shapely.Polygon(shapely.get_exterior_ring(shape.solid))
+        if (solid.buffer(-depth) if depth else solid).intersects(line):
+            return shape.name
+    return ""
+
+
+@dataclass(frozen=True)
+class SceneWarning:
+    """A warning on a scene that is valid but may be a mistake.
+
+    Attributes:
+        what: overlap, gap, hole or wall.
+        shapes: names of the shapes that it is about.
+        value: the gap's width, or how far a shape reaches beyond the wall [m]; of an overlap its area [m^2].
+        place: where [m].
+        text: the same in words.
+    """
+
+    what: str
+    shapes: tuple[str, ...]
+    value: float
+    place: tuple[float, float]
+    text: str
+
+
+def scene_warnings(scene: Scene, needle_width: float) -> list[SceneWarning]:
+    """Return the warnings on a scene, shape by shape, then pair by pair.
+
+    Args:
+        scene: to look through.
+        needle_width: a gap or a hole narrower than this lets no needle pass [m].
+    """
+    warnings = [w for shape in scene.shapes for w in _shape_warnings(shape, scene.dish.radius, needle_width)]
+    for first, second in combinations(scene.shapes, 2):
+        if shapely.box(*first.solid.bounds).distance(shapely.box(*second.solid.bounds)) < needle_width:
+            warnings += _pair_warnings(first, second, needle_width)
+    return warnings
+
+
+def _shape_warnings(shape: SceneShape, dish_radius: float, needle_width: float) -> Iterator[SceneWarning]:
+    outline = shapely.get_coordinates(shape.solid.exterior)
+    x, y = outline[np.argmax(np.hypot(*outline.T))].tolist()  # the point that is farthest from the dish's centre
+    room = dish_radius - math.hypot(x, y)
+    if room < 0.0:
+        text = f"{shape.name} lies across the wall: it reaches {_mm(-room)} mm beyond"
+        yield SceneWarning("wall", (shape.name,), -room, (x, y), text)
+    elif room < needle_width:
+        yield SceneWarning("gap", (shape.name,), room, (x, y), _gap(f"{shape.name} and the wall", room, (x, y)))
+    for hole in map(shapely.Polygon, shape.solid.interiors):
+        tolerance = 0.01 * needle_width
+        circle = shapely.maximum_inscribed_circle(hole, tolerance)
+        (x, y), width = circle.coords[0], 2.0 * circle.length
+        if width < needle_width - tolerance:
+            text = f"a hole of {shape.name} at {_at((x, y))} is {_mm(width)} mm wide: narrower than the needle"
+            yield SceneWarning("hole", (shape.name,), width, (x, y), text)
+
+
+def _pair_warnings(first: SceneShape, second: SceneShape, needle_width: float) -> Iterator[SceneWarning]:
+    names = (first.name, second.name)
+    common = first.solid.intersection(second.solid)
+    gap = float(first.solid.distance(second.solid))
+    # Shapes that share a boundary do not overlap.
+    if common.area > 1e-12:
+        (place,) = common.representative_point().coords
+        text = f"{first.name} and {second.name} overlap by {1e6 * common.area:.3g} mm^2 at {_at(place)}"
+        yield SceneWarning("overlap", names, float(common.area), place, text)
+    elif gap < needle_width:
+        middle = shapely.shortest_line(first.solid, second.solid).interpolate(0.5, normalized=True)
+        (place,) = middle.coords
+        yield SceneWarning("gap", names, gap, place, _gap(f"{first.name} and {second.name}", gap, place))
+
+
+def _gap(between: str, width: float, place: tuple[float, float]) -> str:
+    return f"the gap between {between} at {_at(place)} is {_mm(width)} mm wide: narrower than the needle"
+
+
+def _mm(length: float) -> str:
+    return f"{1e3 * length:.3g}"
+
+
+def _at(place: tuple[float, float]) -> str:
+    return f"({1e3 * place[0]:.2f}, {1e3 * place[1]:.2f}) mm"

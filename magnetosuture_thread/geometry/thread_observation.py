@@ -1,8 +1,8 @@
-"""What the camera sees of the thread: pieces, which of their ends are real, and how much of the thread is hidden."""
+"""The thread as the camera sees it: pieces, which of their ends are real, and how much of the thread is hidden."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -11,7 +11,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_a
 
 
 class PieceEnd(IntEnum):
-    """Why a piece ends where it does; the numbers are those of `ThreadPiece.msg`."""
+    """The reason why a piece ends where it does; the numbers are those of `ThreadPiece.msg`."""
 
     UNKNOWN = 0  # nothing tells
     TAIL = 1  # the thread leaves the needle here
@@ -51,7 +51,7 @@ class ThreadPiece:
 
 @dataclass(frozen=True)
 class ThreadObservation:
-    """What one frame shows of the thread.
+    """The thread as one frame shows it.
 
     Attributes:
         pieces: the one that leaves the needle first, if it is seen; then the others in the order of their arc length,
@@ -62,7 +62,7 @@ class ThreadObservation:
 
     pieces: tuple[ThreadPiece, ...] = ()
     complete: bool = False
-    hidden: tuple[Points, ...] = field(default=())
+    hidden: tuple[Points, ...] = ()
 
     @property
     def from_tail(self) -> Points | None:

@@ -28,7 +28,7 @@ from magnetosuture_thread.bags.reading import constant_name, heading_known, marg
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.estimator.disturbance import disturbance_text
-from magnetosuture_thread.geometry.orientation import heading_angle
+from magnetosuture_thread.geometry.needle_arc import heading_angle
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import ACTIONS, Inbox, Latest, Services
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor

@@ -21,9 +21,8 @@ from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.rig.camera import encode_jpeg
-from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Rig, RigFrame, ground_truth_outputs
-from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.rig.settings import Fault, RigSettings
 from magnetosuture_thread.settings import interface
 
 PERIOD = 0.005  # s between two looks at the boards, which keep real time; simulated, between two messages on /clock

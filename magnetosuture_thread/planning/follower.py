@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.needle_arc import needle_chord
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import WALL_NAME, find_collision
+from magnetosuture_thread.geometry.scene import WALL_NAME, Scene, find_collision
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError

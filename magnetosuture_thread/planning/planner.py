@@ -18,8 +18,7 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import WALL_NAME
+from magnetosuture_thread.geometry.scene import WALL_NAME, Scene
 from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,

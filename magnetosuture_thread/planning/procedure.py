@@ -19,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
-from magnetosuture_thread.geometry.scene_checks import WALL_NAME
+from magnetosuture_thread.geometry.scene import WALL_NAME
 from magnetosuture_thread.settings.configuration import (
     Configuration,
     from_mapping,

@@ -9,8 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import WALL_NAME
+from magnetosuture_thread.geometry.scene import WALL_NAME, Scene
 from magnetosuture_thread.planning.procedure import (
     BringEnd,
     Lay,

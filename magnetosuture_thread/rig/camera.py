@@ -6,9 +6,8 @@ hot spots, dust, soft shadows, a tapered steel needle, a thread about one pixel 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -23,23 +22,20 @@ from magnetosuture_thread.geometry.polyline import Points
 Image = NDArray[np.uint8]
 Light = NDArray[np.float32]
 Box = tuple[slice, slice]
-ToCanvas = Callable[[Points], NDArray[np.int32]]
 
 OVERSAMPLING = 4
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
+LIGHT_BGR = (0.955, 0.985, 1.0)
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 REACH_PX = 24.0  # of shadows and blur around what moves
 SHIFTS = 64  # px by which noise is shifted at the most, along rows and columns: 64^6 ways, of three colours
-# Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
-RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
-GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
 
 
 @dataclass(frozen=True)
 class Look:
-    """How an obstacle looks. A tracker measures on green, so that soft tissue differs from the floor in the others.
+    """The look of an obstacle. A tracker measures on green, so that soft tissue differs from the floor in the others.
 
     Attributes:
         bgr: its colour, blue, green, red from 0 to 255.
@@ -56,9 +52,8 @@ class Look:
     mottle: float = 0.0
 
 
-SILICONE = Look((168.0, 176.0, 205.0), (168.0, 176.0, 205.0))
 LOOKS = {
-    "silicone": SILICONE,
+    "silicone": Look((168.0, 176.0, 205.0), (168.0, 176.0, 205.0)),
     "tissue": Look((196.0, 194.0, 242.0), (178.0, 184.0, 236.0), 0.7e-3, 9.0, 8.0),
     "hernia": Look((164.0, 166.0, 226.0), (150.0, 162.0, 212.0), 0.5e-3, 6.0, 4.0),
 }
@@ -97,7 +92,6 @@ class Lighting:
     Attributes:
         gain: of the exposure; 1 is well exposed.
         slope: how much darker one corner is than the opposite one, in units of the usual.
-        tint_bgr: colour of the light.
         glare: strength of the lamp's reflections in the liquid, 0 for none.
         noise: standard deviation of the sensor's noise, in units of the usual.
         blur_px: the lens's, as the standard deviation of a Gaussian.
@@ -105,7 +99,6 @@ class Lighting:
 
     gain: float = 1.0
     slope: float = 1.0
-    tint_bgr: tuple[float, float, float] = (0.955, 0.985, 1.0)
     glare: float = 1.0
     noise: float = 1.0
     blur_px: float = 0.75
@@ -166,7 +159,7 @@ class DishCamera:
         self.size = size
         self._lighting = lighting or Lighting()
         self._random = np.random.default_rng(seed)
-        self._background = _StillLife(scene, self._lighting, view, size, self._random).draw()
+        self._background = self._still_life()
         self._still = self._through_lens(self._background)
         self._noise = [self._noise_field() for _ in range(noise_fields)]
         self._whole = slice(0, size[1]), slice(0, size[0])
@@ -195,17 +188,15 @@ class DishCamera:
         edges = [self.view.to_pixels(cover.outline) for cover in covers]
         box = box_around(np.vstack([outline, line, *edges]), self.size, REACH_PX)
         chosen = int(self._random.integers(len(self._noise)))
-        usual = gain == 1.0
-        image = (
-            self._exposed[chosen].copy()
-            if usual
-            else self._expose(self._still, self._noise_in(self._whole, chosen), gain)
-        )
+        image: Image = self._exposed[chosen].copy()
+        if gain != 1.0:
+            image = self._expose(self._still, self._noise_in(self._whole, chosen), gain)
         if box is not None:
             region = self._background[box].copy()
             self._add_strand_and_needle(region, box, line, outline, tail, heading)
             for cover, edge in zip(covers, edges, strict=True):
-                self._add_cover(region, box, cover, edge)
+                hidden = cv2.GaussianBlur(covered(box, [edge]), (0, 0), cover.blur_px)
+                lay(region, hidden, cover.opacity, cover.bgr)
             image[box] = self._expose(self._through_lens(region), self._noise_in(box, chosen), gain)
         return image
 
@@ -216,41 +207,34 @@ class DishCamera:
         strand = line_covered(box, line, MENISCUS * scene.thread_diameter / scale)
         shade = np.float32(0.35) * strand
         near = box_around(outline, self.size, REACH_PX)
-        needle = None
         if near is not None:
-            needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
-            inside = _within(near, box)
+            needle, inside = covered(near, [outline]), _within(near, box)
             np.maximum(shade[inside], needle, out=shade[inside])
         # Shifted to the right and down by 2.5 and 3.5 px, from the middle of the kernel's 26 values.
         cast = cv2.sepFilter2D(shade, cv2.CV_32F, SHADOW, SHADOW, anchor=(15, 16), borderType=cv2.BORDER_CONSTANT)
         lay(region, cast, 0.16, (0.0, 0.0, 0.0))
         lay(region, strand, 1.0, scene.thread_bgr)
-        if near is not None and needle is not None:
+        if near is not None:
             lay(region[inside], needle, 1.0, STEEL_BGR)
-            lay(
-                region[inside], line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0), 1.0, GLEAM_BGR
-            )
-
-    def _add_cover(self, region: Light, box: Box, cover: Cover, edge: Points) -> None:
-        hidden = covered(box, lambda canvas, at: cv2.fillPoly(canvas, [at(edge)], 255, cv2.LINE_8, 4))
-        lay(region, cv2.GaussianBlur(hidden, (0, 0), cover.blur_px), cover.opacity, cover.bgr)
+            lay(region[inside], line_covered(near, self._gleam(tail, heading), 1.0), 1.0, GLEAM_BGR)
 
     def _needle_outline(self, tail: Points, heading: float) -> Points:
         """Return the needle's outline in pixels: a body of one width, the last fifth tapering to a fine point."""
         at = np.concatenate([np.linspace(0.0, 0.8, 17), np.linspace(0.84, 1.0, 5)])
         half = 0.5 * self._scene.needle_width * np.interp(at, [0.8, 1.0], [1.0, 0.12])
-        points, along = needle_axis(tail, heading, self._scene.needle_length, self._scene.needle_curvature, at)
-        aside = half[:, None] * np.column_stack([-along[:, 1], along[:, 0]])
-        return self.view.to_pixels(np.vstack([points - aside, (points + aside)[::-1]]))
+        points, left = self._axis(tail, heading, at)
+        return self.view.to_pixels(np.vstack([points - half[:, None] * left, (points + half[:, None] * left)[::-1]]))
 
     def _gleam(self, tail: Points, heading: float) -> Points:
-        """Return the line along which the body reflects the lamp: on the side that faces it."""
-        scene = self._scene
-        at = np.linspace(0.07, 0.77, 15)
-        points, along = needle_axis(tail, heading, scene.needle_length, scene.needle_curvature, at)
-        aside = np.column_stack([-along[:, 1], along[:, 0]])
-        # Direction towards the lamp, in the dish frame.
-        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ (-0.5, 0.86))[:, None] * aside)
+        """Return the line along which the body reflects the lamp, in pixels: on the side that faces it."""
+        points, left = self._axis(tail, heading, np.linspace(0.07, 0.77, 15))
+        facing = np.tanh(2.0 * left @ (-0.5, 0.86))  # towards the lamp, in the dish frame
+        return self.view.to_pixels(points + 0.22 * self._scene.needle_width * facing[:, None] * left)
+
+    def _axis(self, tail: Points, heading: float, at: Points) -> tuple[Points, Points]:
+        """Return points of the needle's axis, and unit vectors to its left."""
+        points, along = needle_axis(tail, heading, self._scene.needle_length, self._scene.needle_curvature, at)
+        return points, np.column_stack([-along[:, 1], along[:, 0]])
 
     def _through_lens(self, light: Light) -> Light:
         return np.asarray(cv2.GaussianBlur(light, (0, 0), self._lighting.blur_px), dtype=np.float32)
@@ -282,38 +266,13 @@ class DishCamera:
         light = light * np.float32(gain * self._lighting.gain)
         return np.asarray(cv2.add(light, cv2.multiply(cv2.sqrt(light), noise), dtype=cv2.CV_8U), dtype=np.uint8)
 
-
-def _within(inner: Box, outer: Box) -> Box:
-    """Return a box in the coordinates of one that holds it."""
-    rows, columns = (slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer, strict=True))
-    return rows, columns
-
-
-@dataclass
-class _StillLife:
-    """Draws the background once.
-
-    Attributes:
-        scene: what stands there.
-        lighting: the light on it.
-        view: where the dish is in the image.
-        size: width and height of the image [px].
-        random: of smears, hot spots and dust.
-    """
-
-    scene: CameraScene
-    lighting: Lighting
-    view: DishView
-    size: tuple[int, int]
-    random: np.random.Generator
-
-    def draw(self) -> Light:
+    def _still_life(self) -> Light:
         """Return the light that falls on the sensor before lens and exposure, shape (rows, columns, 3)."""
         width, height = self.size
-        view, lighting = self.view, self.lighting
+        view, lighting, scene = self.view, self._lighting, self._scene
         u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         scale = view.metres_per_pixel
-        radius = np.float32(0.5 * self.scene.dish_diameter)
+        radius = np.float32(0.5 * scene.dish_diameter)
         away = np.hypot(u - view.centre_px[0], v - view.centre_px[1]).astype(np.float32) * np.float32(scale)
         slope = (lighting.slope * (u / width + v / height - 1.0)).astype(np.float32)
         table = 176.0 - 10.0 * slope + self._smear(12.0, 80.0)
@@ -324,125 +283,103 @@ class _StillLife:
         table *= 1.0 - shade * (0.5 + 0.5 * np.tanh((away - radius - 1.1e-3) / (2.0 * scale)))
         inside = 0.5 - 0.5 * np.tanh((away - radius - 0.25e-3) / (0.8 * scale))
         light = table * (1.0 - inside) + floor * inside
-        for beyond, spread, depth in RIM_DEPTHS:
-            light -= depth * np.exp(-(((away - radius - beyond) / spread) ** 2))
-        light += 22.0 * np.exp(-(((away - radius - 0.6e-3) / 0.15e-3) ** 2))
-        image = np.asarray(light[:, :, None] * np.asarray(lighting.tint_bgr, dtype=np.float32), dtype=np.float32)
-        looks = self.scene.looks or [SILICONE] * len(self.scene.obstacles)
-        for obstacle, look in zip(self.scene.obstacles, looks, strict=True):
+        # The two edges of the rim, and the light between them; the inner one is where other frames of a dish have it.
+        for beyond, spread, depth in ((0.199e-3, 0.21e-3, -145.0), (0.98e-3, 0.18e-3, -100.0), (0.6e-3, 0.15e-3, 22.0)):
+            light += depth * np.exp(-(((away - radius - beyond) / spread) ** 2))
+        image = np.asarray(light[:, :, None] * np.array(LIGHT_BGR, np.float32), dtype=np.float32)
+        looks = scene.looks or [LOOKS["silicone"]] * len(scene.obstacles)
+        for obstacle, look in zip(scene.obstacles, looks, strict=True):
             self._add_obstacle(image, obstacle, look)
         self._add_glare(image)
-        self._add_dust(image)
+        dust = np.zeros((height, width), np.float32)
+        for _ in range(14):  # specks and rings
+            centre = np.array([self._random.integers(0, width), self._random.integers(0, height)])
+            size, thickness = (3, 1) if self._random.random() < 0.3 else (1, -1)
+            depth, box = float(self._random.uniform(4.0, 16.0)), box_around(centre[None], self.size, REACH_PX)
+            assert box is not None  # the centre is in the image
+            speck = np.zeros_like(dust[box])
+            cv2.circle(speck, (centre - (box[1].start, box[0].start)).tolist(), size, 1.0, thickness)
+            dust[box] += depth * cv2.GaussianBlur(speck, (0, 0), 0.9)
+        image -= dust[:, :, None]
         return np.asarray(np.clip(image, 0.0, 258.0, out=image), dtype=np.float32)
 
     def _smear(self, depth: float, size: float) -> Light:
         """Return smooth random light of a given depth and feature size [px]."""
         width, height = self.size
-        rough = self.random.standard_normal((height // 4 + 1, width // 4 + 1), dtype=np.float32)
+        rough = self._random.standard_normal((height // 4 + 1, width // 4 + 1), dtype=np.float32)
         smooth = cv2.GaussianBlur(rough, (0, 0), size / 4.0)
         smooth *= np.float32(0.5 * depth) / np.float32(max(float(smooth.std()), 1e-9))
         return np.asarray(cv2.resize(smooth, self.size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
     def _add_obstacle(self, image: Light, obstacle: Obstacle, look: Look) -> None:
         """Add a solid: a soft shadow, its top, a highlight on a disc."""
-        rings = [self.view.to_pixels(ring) for ring in still_outlines(obstacle)]
-        corners = np.vstack(rings)
-        box = box_around(corners, self.size, margin=24.0)
+        if isinstance(obstacle, Disc):
+            outlines = [np.asarray(obstacle.centre) + obstacle.radius * _circle(256)]
+        else:
+            outlines = obstacle.rings
+        rings = [self.view.to_pixels(ring) for ring in outlines]
+        box = box_around(np.vstack(rings), self.size, margin=24.0)
         if box is None:
             return
         region = image[box]
-
-        def solid(of: Sequence[Points]) -> Light:
-            return covered(box, lambda canvas, to: cv2.fillPoly(canvas, [to(r) for r in of], 255, cv2.LINE_8, 4))
-
-        shade = cv2.GaussianBlur(solid([ring + np.array([3.0, 4.0]) for ring in rings]), (0, 0), 4.0)
+        shade = cv2.GaussianBlur(covered(box, [ring + np.array([3.0, 4.0]) for ring in rings]), (0, 0), 4.0)
         region *= 1.0 - 0.2 * shade[:, :, None]
-        top = solid(rings)
+        top = covered(box, rings)
         colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
         region += top[:, :, None] * (colour - region)
         if isinstance(obstacle, Disc):
             radius = obstacle.radius / self.view.metres_per_pixel
             small = self.view.to_pixels(np.asarray(obstacle.centre)) - 0.35 * radius
-            ring = small + 0.25 * radius * _circle(128)
-            shine = cv2.GaussianBlur(solid([ring]), (0, 0), 0.15 * radius + 0.5)
+            shine = cv2.GaussianBlur(covered(box, [small + 0.25 * radius * _circle(128)]), (0, 0), 0.15 * radius + 0.5)
             region += shine[:, :, None] * 40.0
 
     def _surface(self, top: Light, look: Look) -> Light:
         """Return the colour of a solid's top, rounded at its outline, shape (rows, columns, 3) or for all (3,)."""
-        colour = np.asarray(look.bgr, dtype=np.float32)
+        colour, edge = np.asarray(look.bgr, dtype=np.float32), np.asarray(look.edge_bgr, dtype=np.float32)
         if not look.rounding:
             return colour
         reach = np.float32(look.rounding / self.view.metres_per_pixel)
         inwards = cv2.distanceTransform((top > 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         level = np.minimum(inwards / reach, 1.0)
         height = cv2.GaussianBlur(np.sqrt(level * (2.0 - level)).astype(np.float32), (0, 0), 0.25 * float(reach) + 0.5)
-        slope = np.stack(
-            [cv2.Sobel(height, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(height, cv2.CV_32F, 0, 1, scale=0.125)]
-        )
+        slope = np.stack([cv2.Sobel(height, cv2.CV_32F, *axis, scale=0.125) for axis in ((1, 0), (0, 1))])
         # Direction towards the lamp, in the image.
         lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray((-0.5, -0.86), np.float32), slope, axes=1)
-        edge = np.asarray(look.edge_bgr, dtype=np.float32)
         return np.asarray(edge + height[:, :, None] * (colour - edge) + lit[:, :, None], dtype=np.float32)
 
     def _add_glare(self, image: Light) -> None:
         """Add two arcs of the lamp's reflection along the wall, and small hot spots."""
-        radius = 0.5 * self.scene.dish_diameter / self.view.metres_per_pixel
-        centre = np.asarray(self.view.centre_px)
-        glare = np.zeros(image.shape[:2], np.float32)
-        for share, first, last, thickness in GLARE_ARCS:
-            angles = np.radians(np.arange(first, last, 0.5))
-            parts = (np.degrees(angles) - first) / (last - first)
-            sizes = np.maximum(np.rint(thickness * np.sin(np.pi * parts)), 1.0).astype(int) // 2
-            dots = centre + share * radius * np.column_stack([np.cos(angles), -np.sin(angles)])
-            box, arc, on_canvas = self._canvas(dots)
-            for dot, size in zip(on_canvas, sizes.tolist(), strict=True):
+        radius, centre = 0.5 * self._scene.dish_diameter / self.view.metres_per_pixel, np.asarray(self.view.centre_px)
+        glare, random = np.zeros(image.shape[:2], np.float32), self._random
+        # Share of the radius, first and last angle [deg], width [px].
+        for share, first, last, thickness in ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0)):
+            degrees = np.degrees(angles := np.radians(np.arange(first, last, 0.5)))
+            sizes = np.rint(thickness * np.sin(np.pi * (degrees - first) / (last - first)))
+            dots = np.rint(centre + share * radius * np.column_stack([np.cos(angles), -np.sin(angles)])).astype(int)
+            arc = np.zeros_like(glare)
+            for dot, size in zip(dots.tolist(), (np.maximum(sizes, 1.0).astype(int) // 2).tolist(), strict=True):
                 cv2.circle(arc, dot, size, 1.0, -1)
-            np.maximum(glare[box], cv2.GaussianBlur(arc, (0, 0), 2.2), out=glare[box])
+            np.maximum(glare, cv2.GaussianBlur(arc, (0, 0), 2.2), out=glare)
         for _ in range(3):
-            angle, share = self.random.uniform(0.0, 2.0 * np.pi), self.random.uniform(0.2, 0.75)
-            axes = (int(self.random.integers(2, 5)), int(self.random.integers(2, 4)))
-            box, spot, (at,) = self._canvas(centre + share * radius * np.array([[np.cos(angle), np.sin(angle)]]))
-            cv2.ellipse(spot, at, axes, 0.0, 0.0, 360.0, 1.0, -1)
-            np.maximum(glare[box], cv2.GaussianBlur(spot, (0, 0), 1.2), out=glare[box])
+            angle, share = random.uniform(0.0, 2.0 * np.pi), random.uniform(0.2, 0.75)
+            axes = (int(random.integers(2, 5)), int(random.integers(2, 4)))
+            at = np.rint(centre + share * radius * np.array([np.cos(angle), np.sin(angle)])).astype(int).tolist()
+            spot = cv2.ellipse(np.zeros_like(glare), at, axes, 0.0, 0.0, 360.0, 1.0, -1)
+            np.maximum(glare, cv2.GaussianBlur(spot, (0, 0), 1.2), out=glare)
         lit = glare > 0.0
-        image[lit] += self.lighting.glare * np.minimum(glare[lit], 1.0)[:, None] * (265.0 - image[lit])
+        image[lit] += self._lighting.glare * np.minimum(glare[lit], 1.0)[:, None] * (265.0 - image[lit])
 
-    def _add_dust(self, image: Light) -> None:
-        """Add faint specks and rings."""
-        width, height = self.size
-        for _ in range(14):
-            centre = [self.random.integers(0, width), self.random.integers(0, height)]
-            size, thickness = (3, 1) if self.random.random() < 0.3 else (1, -1)
-            depth = float(self.random.uniform(4.0, 16.0))
-            box, speck, (at,) = self._canvas(np.array([centre]))
-            cv2.circle(speck, at, size, 1.0, thickness)
-            image[box] -= depth * cv2.GaussianBlur(speck, (0, 0), 0.9)[:, :, None]
 
-    def _canvas(self, centres: Points) -> tuple[Box, Light, list[tuple[int, int]]]:
-        """Return the part of the image that something small and its blur may reach, and a canvas with its centres.
-
-        Args:
-            centres: of what is drawn, shape (m, 2) [px]; with a radius of 5 px at most, and a blur of 2.2.
-        """
-        margin, last = 24.0, np.array(self.size) - 1  # 5 px, and twice the 9 px that the blur reaches
-        left, top = np.clip(np.floor(centres.min(axis=0) - margin), 0.0, last).astype(int).tolist()
-        right, bottom = np.clip(np.ceil(centres.max(axis=0) + margin), 0.0, last).astype(int).tolist()
-        at = np.rint(centres).astype(int) - (left, top)
-        box = slice(top, bottom + 1), slice(left, right + 1)
-        return box, np.zeros((bottom + 1 - top, right + 1 - left), np.float32), [(x, y) for x, y in at.tolist()]
+def _within(inner: Box, outer: Box) -> Box:
+    """Return a box in the coordinates of one that holds it."""
+    rows, columns = (slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer, strict=True))
+    return rows, columns
 
 
 def _circle(corners: int) -> Points:
     """Return a unit circle as a polygon, shape (corners, 2)."""
     angles = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     return np.column_stack([np.cos(angles), np.sin(angles)])
-
-
-def still_outlines(obstacle: Obstacle) -> list[Points]:
-    """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m]."""
-    if isinstance(obstacle, Disc):
-        return [np.asarray(obstacle.centre) + obstacle.radius * _circle(256)]
-    return obstacle.rings
 
 
 def box_around(points: Points, size: tuple[int, int], margin: float) -> Box | None:
@@ -464,21 +401,22 @@ def box_around(points: Points, size: tuple[int, int], margin: float) -> Box | No
     return slice(int(top), int(bottom)), slice(int(left), int(right))
 
 
-def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
-    """Return the share of each pixel in a box that a shape covers, shape (rows, columns).
+def covered(box: Box, lines: Sequence[Points], wide: int = 0) -> Light:
+    """Return the share of each pixel in a box that polygons cover, shape (rows, columns).
 
     Args:
         box: rows and columns.
-        draw: called with a canvas and what turns pixels (u, v) into its coordinates, in sixteenths.
+        lines: outlines of the polygons and of their holes, each of shape (m, 2) [px].
+        wide: 0, or the width of lines that are drawn in their place, in pixels over `OVERSAMPLING`.
     """
     rows, columns = box[0].stop - box[0].start, box[1].stop - box[1].start
-    canvas = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8)
-
-    def on_canvas(pixels: Points) -> NDArray[np.int32]:
-        at = (pixels - (box[1].start, box[0].start) + 0.5) * OVERSAMPLING - 0.5
-        return np.asarray(np.round(16.0 * at), dtype=np.int32)
-
-    draw(canvas, on_canvas)
+    canvas, origin = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8), (box[1].start, box[0].start)
+    # In sixteenths.
+    at = [np.round(16.0 * ((line - origin + 0.5) * OVERSAMPLING - 0.5)).astype(np.int32) for line in lines]
+    if wide:
+        cv2.polylines(canvas, at, False, 255, wide, cv2.LINE_8, 4)
+    else:
+        cv2.fillPoly(canvas, at, 255, cv2.LINE_8, 4)
     small = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)
     return np.asarray(small * np.float32(1.0 / 255.0), dtype=np.float32)
 
@@ -508,12 +446,8 @@ def line_covered(box: Box, line: Points, width_px: float) -> Light:
         if left < right and top < bottom:
             part = slice(top, bottom), slice(left, right)
             inside = result[_within(part, box)]
-            np.maximum(inside, _line_drawn(part, line[first : last + 1], wide), out=inside)
+            np.maximum(inside, covered(part, [line[first : last + 1]], wide), out=inside)
     return np.asarray(result * np.float32(min(1.0, width_px * OVERSAMPLING / wide)))
-
-
-def _line_drawn(box: Box, line: Points, wide: int) -> Light:
-    return covered(box, lambda canvas, at: cv2.polylines(canvas, [at(line)], False, 255, wide, cv2.LINE_8, 4))
 
 
 @compiled

@@ -27,11 +27,10 @@ from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings.errors import ConfigurationError, SolverError
 
 MAX_TIME = 600.0  # s; of a run
-# What a run must keep to succeed, besides its goals.
+# What a run must keep to succeed, besides its goals, and one and a half times its ideal time.
 KEEP_OUT_TOLERANCE = 5e-6  # m
 PENETRATION_TOLERANCE = 1e-6  # m
 MAX_REST = 3.0  # s
-MAX_TIME_RATIO = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +67,10 @@ def vary(setup: Setup, seed: int) -> Variation:
         return float(1.0 + share * random.uniform(-1.0, 1.0))
 
     liquid = factor(0.3)
-    changed = replace(
-        rig,
-        seed=seed,
-        viscosity=rig.viscosity * liquid,
-        thread_drag_across=rig.thread_drag_across * liquid,
-        thread_drag_along=rig.thread_drag_along * liquid,
-        thread_bending_stiffness=rig.thread_bending_stiffness * factor(0.5),
-        thread_friction=float(random.uniform(0.0, 0.3)),
-    )
+    liquids = {name: getattr(rig, name) * liquid for name in ("viscosity", "thread_drag_across", "thread_drag_along")}
+    stiffness = rig.thread_bending_stiffness * factor(0.5)
+    friction = float(random.uniform(0.0, 0.3))
+    changed = replace(rig, seed=seed, **liquids, thread_bending_stiffness=stiffness, thread_friction=friction)
     gains = 1.0 + 0.05 * random.uniform(-1.0, 1.0, len(rig.coil_angles))
     x, y, heading = rig.needle_start
     for _ in range(100):
@@ -100,7 +94,7 @@ def vary(setup: Setup, seed: int) -> Variation:
 
 @dataclass
 class RunFigures:
-    """What is measured of a run, all of it in the ground truth of the simulation but for the friction.
+    """The figures of a run, all of them in the ground truth of the simulation but for the friction.
 
     Attributes:
         time_s: from the start of the procedure to its end.
@@ -136,7 +130,7 @@ class RunFigures:
             keep_out: of the bridge [m].
         """
         clearance, allowed = self.min_needle_clearance_m, keep_out - KEEP_OUT_TOLERANCE
-        deep, rest, ratio = self.max_thread_penetration_m, self.longest_rest_s, MAX_TIME_RATIO * self.ideal_time_s
+        deep, rest, ratio = self.max_thread_penetration_m, self.longest_rest_s, 1.5 * self.ideal_time_s
         tension, friction = self.max_tension_excess_n, self.max_friction_excess
         near = f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * allowed:.3f} allowed)"
         within = f"a node of the thread {1e6 * deep:.1f} µm in wall or shape"
@@ -194,7 +188,7 @@ class RunExtremes:
         self.closest: RunInstant | None = None
         self._last: deque[RunInstant] = deque()
         self._angle = 0.0  # of the needle's chord [rad]
-        self._anchor: tuple[float, float, float, float] | None = None
+        self._anchor = (0.0, math.inf, math.inf, math.inf)
 
     def update(self, frame: LoopFrame, running: bool, goal: int, path: Points | None) -> None:
         """Take a frame.
@@ -210,23 +204,23 @@ class RunExtremes:
         c, s = math.cos(angle), math.sin(angle)
         axis = self._planner.body @ np.array([[c, s], [-s, c]]) + middle
         instant = RunInstant(frame, axis, self._distance(axis), goal, path)
-        found, limits, nodes = self.figures, self._limits[goal], frame.condition.friction_nodes
-        if instant.clearance < found.min_needle_clearance_m:
-            found.min_needle_clearance_m, self.closest = instant.clearance, instant
-        found.max_thread_penetration_m = max(found.max_thread_penetration_m, -self._distance(frame.thread))
-        found.max_tension_n = max(found.max_tension_n, frame.tension)
-        found.max_friction_nodes = max(found.max_friction_nodes, nodes)
-        found.max_tension_excess_n = max(found.max_tension_excess_n, frame.tension - limits.tension)
-        found.max_friction_excess = max(found.max_friction_excess, nodes - limits.friction_nodes)
+        figures, limits, nodes = self.figures, self._limits[goal], frame.condition.friction_nodes
+        if instant.clearance < figures.min_needle_clearance_m:
+            figures.min_needle_clearance_m, self.closest = instant.clearance, instant
+        figures.max_thread_penetration_m = max(figures.max_thread_penetration_m, -self._distance(frame.thread))
+        figures.max_tension_n = max(figures.max_tension_n, frame.tension)
+        figures.max_friction_nodes = max(figures.max_friction_nodes, nodes)
+        figures.max_tension_excess_n = max(figures.max_tension_excess_n, frame.tension - limits.tension)
+        figures.max_friction_excess = max(figures.max_friction_excess, nodes - limits.friction_nodes)
         if self._wrap is not None:
             swept = math.degrees(winding(frame.thread, centre_of(self._scene, self._wrap.around)))
-            found.wrap_degrees = max(found.wrap_degrees, abs(swept))
+            figures.wrap_degrees = max(figures.wrap_degrees, abs(swept))
         # Not wrapped at a half turn, over which noise would be a turn of the needle.
         self._angle += math.remainder(angle - self._angle, 2.0 * math.pi)
         at = (frame.time, float(middle[0]), float(middle[1]), self._planner.lever * self._angle)
-        if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > 5e-5:  # m: it does not rest
+        if not running or math.dist(at[1:], self._anchor[1:]) > 5e-5:  # m: it does not rest
             self._anchor = at
-        found.longest_rest_s = max(found.longest_rest_s, frame.time - self._anchor[0])
+        figures.longest_rest_s = max(figures.longest_rest_s, frame.time - self._anchor[0])
         self._last.append(instant)
         while self._last[0].frame.time < frame.time - 4.0:
             self._last.popleft()
@@ -237,16 +231,16 @@ class RunExtremes:
         return tuple(self._last[round(index)] for index in np.linspace(0, len(self._last) - 1, count))
 
     def _distance(self, points: Points) -> float:
-        shapes = len(self._packed.shapes)
-        found, normal = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
-        measure(np.ascontiguousarray(points), self._packed, found, normal)
-        wall = self._scene.dish.radius - float(np.hypot(points[:, 0], points[:, 1]).max())
-        return min(wall, float(found.min(initial=math.inf)))
+        size = len(points), len(self._packed.shapes)
+        distances, normals = np.empty(size), np.empty((*size, 2))
+        measure(np.ascontiguousarray(points), self._packed, distances, normals)
+        wall = self._scene.dish.radius - float(np.hypot(*points.T).max())
+        return min(wall, float(distances.min(initial=math.inf)))
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run.
+    """The result of a run.
 
     Attributes:
         seed: of the run.
@@ -272,8 +266,8 @@ class RunResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, in the unit that each name ends with."""
-        found = {"seed": self.seed, "success": self.success, "reason": self.reason, "goals_met": self.goals_met}
-        return {**found, **asdict(self.figures)}
+        outcome = {"seed": self.seed, "success": self.success, "reason": self.reason, "goals_met": self.goals_met}
+        return {**outcome, **asdict(self.figures)}
 
 
 def check_run(procedure: Procedure, setup: Setup, variation: Variation) -> None:
@@ -318,7 +312,7 @@ def run_procedure(
     pilot, rig = _Pilot(procedure, planner), Rig(variation.setup.rig, setup.scene)
     execution = pilot.executor
     truth: dict[str, Any] = {"losses": variation.losses, "coil_gains": variation.coil_gains, "recorder": recorder}
-    loop = ClosedLoop(setup, rig, pilot.compute_command, variation.seed, camera=camera, **truth)
+    loop = ClosedLoop(setup, rig, pilot, variation.seed, camera=camera, **truth)
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
     figures, truth_of_goals = extremes.figures, GoalTruth(procedure, setup.scene)
@@ -358,11 +352,8 @@ def run_procedure(
     figures.time_s = rig.time - began if math.isfinite(began) else rig.time
     figures.ideal_time_s = planned * (weighted / way if way > 0.0 else 1.0)
     reached = execution.state is executor.ProcedureState.DONE
-    reasons = [
-        *filter(None, [reason]),
-        *truth_of_goals.failures(reached),
-        *figures.beyond_limits(setup.coils.keep_out).values(),
-    ]
+    limits = figures.beyond_limits(setup.coils.keep_out).values()
+    reasons = [*filter(None, [reason]), *truth_of_goals.failures(reached), *limits]
     met = len(procedure.goals) if reached else execution.goal
     instants, closest = extremes.last_instants() if reasons else (), extremes.closest if reasons else None
     words = "; ".join(reasons)
@@ -391,7 +382,7 @@ class _Pilot:
         self.executor = executor.ProcedureExecutor(procedure, planner, self._submit)
         self._now = 0.0
 
-    def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: executor.ThreadCondition) -> Vector:
+    def __call__(self, stamp: float, tail: Vector, heading: Vector, thread: executor.ThreadCondition) -> Vector:
         """Return the velocity of the tip, and begin as soon as the thread is known."""
         self._now = stamp
         if self.executor.state is executor.ProcedureState.READY and not thread.problem:

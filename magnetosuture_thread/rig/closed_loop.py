@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -34,8 +33,6 @@ Vector = NDArray[np.float64]
 
 START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
 LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph
-TAIL_DEVIATION, HEADING_DEVIATION = 1e-5, 5e-3  # m and rad; of a tracked needle, see docs/results.md
-THREAD_DEVIATION, THREAD_CORRELATION = 1e-5, 5e-4  # m; of a tracked centreline, and along it
 
 RECORDED = (  # what the bag of a run holds, besides frames
     *(interface.SCENE, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL),
@@ -73,7 +70,7 @@ class LoopFrame:
     reason: str
 
 
-@dataclass(order=True)
+@dataclass
 class Measurement:
     """Needle and thread as measured in a frame.
 
@@ -88,10 +85,10 @@ class Measurement:
 
     due: float
     stamp: float
-    tail: Vector = field(compare=False)
-    heading: Vector = field(compare=False)
-    covariance: Vector = field(compare=False)
-    observation: ThreadObservation | None = field(compare=False)
+    tail: Vector
+    heading: Vector
+    covariance: Vector
+    observation: ThreadObservation | None
 
 
 class LoopRecorder(Protocol):
@@ -133,8 +130,7 @@ class ClosedLoop:
         coil_gains: Vector | None = None,
         recorder: LoopRecorder | None = None,
     ) -> None:
-        self.setup, self.rig, self._controller = setup, rig, controller
-        self._recorder = recorder
+        self.setup, self.rig, self._controller, self._recorder = setup, rig, controller, recorder
         self._random, self._losses = np.random.default_rng([seed, 1]), losses
         self._gains = np.ones(len(rig.currents)) if coil_gains is None else coil_gains
         latch, self._driver = ArmingLatch(), DriverState(True)
@@ -145,10 +141,8 @@ class ClosedLoop:
         self._tracker = TrackerSession(setup.vision, setup.scene) if camera else None
         self.now = self._next_frame = START
         self._waiting: list[Measurement] = []
-        self._count = 0
-        self._condition = ThreadCondition(problem="no thread yet")
-        self._commanded = np.zeros(2)
-        self._reason, self._drift = "", 0.0
+        self._count, self._reason, self._drift = 0, "", 0.0
+        self._condition, self._commanded = ThreadCondition(problem="no thread yet"), np.zeros(2)
 
     def step(self) -> LoopFrame | None:
         """Go on by a period of the bridge; return the frame if one was taken.
@@ -163,7 +157,7 @@ class ClosedLoop:
         else:
             self.rig.advance(self.now - START)
         while self._waiting and self._waiting[0].due <= self.now + 1e-9:
-            self._measured(heapq.heappop(self._waiting))
+            self._take(self._waiting.pop(0))
         output = self.bridge.step(self.now, self.now, self._driver)
         self._reason, self._drift = output.reason, output.drift
         if self._recorder is not None:
@@ -178,25 +172,17 @@ class ClosedLoop:
             self._recorder.on_frame(self.now, frame)
         lost = self._random.uniform() < self._losses
         if not lost and (measured := self._measure(frame)) is not None:
-            heapq.heappush(self._waiting, measured)
-        return LoopFrame(
-            self.now - START,
-            frame.tail.copy(),
-            frame.heading,
-            frame.thread.copy(),
-            float(self.rig.tension.max(initial=0.0)),
-            self._condition,
-            self._commanded,
-            self._reason,
-        )
+            self._waiting = sorted([*self._waiting, measured], key=lambda waiting: waiting.due)
+        truth = frame.tail.copy(), frame.heading, frame.thread.copy(), float(self.rig.dynamics.tension.max(initial=0.0))
+        return LoopFrame(self.now - START, *truth, self._condition, self._commanded, self._reason)
 
     def _measure(self, frame: RigFrame) -> Measurement | None:
         due = self.now + LATENCY
         if self._tracker is None:
-            tail = frame.tail + TAIL_DEVIATION * self._random.standard_normal(2)
-            angle = frame.heading + HEADING_DEVIATION * self._random.standard_normal()
-            covariance = np.diag([TAIL_DEVIATION**2, TAIL_DEVIATION**2, HEADING_DEVIATION**2])
-            heading = np.array([math.cos(angle), math.sin(angle)])
+            deviation = np.array([1e-5, 1e-5, 5e-3])  # m and rad; of a tracked needle, see docs/results.md
+            tail = frame.tail + deviation[:2] * self._random.standard_normal(2)
+            angle = frame.heading + deviation[2] * self._random.standard_normal()
+            heading, covariance = np.array([math.cos(angle), math.sin(angle)]), np.diag(deviation**2)
             return Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
         if frame.image is None:
             return None
@@ -206,17 +192,15 @@ class ClosedLoop:
         return Measurement(due, self.now, track.tail, track.heading, track.covariance, track.observation)
 
     def _observe(self, thread: Points) -> ThreadObservation:
-        """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
-        length = float(arc_lengths(thread)[-1])
-        at = np.linspace(0.0, length, 64)
-        points = points_at(thread, at)
-        knots = np.arange(0.0, length + THREAD_CORRELATION, THREAD_CORRELATION)
+        """Return the thread with the noise of a tracked centreline, which is alike over a length."""
+        deviation, alike, length = 1e-5, 5e-4, float(arc_lengths(thread)[-1])  # m
+        at, knots = np.linspace(0.0, length, 64), np.arange(0.0, length + alike, alike)
         noise = np.column_stack([np.interp(at, knots, self._random.standard_normal(len(knots))) for _ in range(2)])
-        deviation, ends = np.full(len(points), THREAD_DEVIATION), (PieceEnd.TAIL, PieceEnd.FREE)
-        piece = ThreadPiece(points + THREAD_DEVIATION * noise, deviation, *ends, (0.0, 0.0))
+        points, deviations = points_at(thread, at) + deviation * noise, np.full(len(at), deviation)
+        piece = ThreadPiece(points, deviations, PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0))
         return ThreadObservation((piece,), complete=True)
 
-    def _measured(self, measured: Measurement) -> None:
+    def _take(self, measured: Measurement) -> None:
         """Hand a measurement to bridge, thread model and controller, in the order of the graph."""
         self._count += 1
         stamp, now = measured.stamp, self.now
@@ -232,9 +216,9 @@ class ClosedLoop:
         margins = result.margins
         slowdown = margins.friction.slowdown if margins else 1.0
         self.bridge.on_margins(stamp, margins is not None, slowdown, result.scene_version, now)
-        self._condition = replace(condition_of(result), drift=self._drift, age=now - stamp)
-        if self.setup.coils.friction_feedback != "all":
-            self._condition = replace(self._condition, slowdown=1.0)
+        condition = replace(condition_of(result), drift=self._drift, age=now - stamp)
+        slows = self.setup.coils.friction_feedback == "all"
+        self._condition = condition if slows else replace(condition, slowdown=1.0)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
         self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
         if self._recorder is not None:
@@ -250,10 +234,8 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
     problem = result.reason if margins is None else ""
     if estimate is not None and estimate.unmeasured_for > 1.0:  # s, after which it is unsure
         problem = f"the thread has not been measured for {estimate.unmeasured_for:.1f} s"
-    tension, nodes, slowdown = forces.peak_tension if forces else 0.0, 0, 1.0
-    if margins is not None:
-        nodes, slowdown = len(margins.friction.nodes), margins.friction.slowdown
-    return ThreadCondition(thread.positions, tension, nodes, slowdown, problem)
+    nodes, slowdown = (len(margins.friction.nodes), margins.friction.slowdown) if margins is not None else (0, 1.0)
+    return ThreadCondition(thread.positions, forces.peak_tension if forces else 0.0, nodes, slowdown, problem)
 
 
 class RunBag:

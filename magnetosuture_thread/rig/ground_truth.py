@@ -1,4 +1,4 @@
-"""Whether the goals of a procedure were made, by the ground truth of a simulation.
+"""The goals of a procedure, judged by the ground truth of a simulation.
 
 Nothing here is shared with what plans and judges the goals in the nodes.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import Any
 
 import numpy as np
 import shapely
@@ -24,7 +23,6 @@ from magnetosuture_thread.planning.procedure import (
     TakeOff,
     Tighten,
     Unwind,
-    Wait,
     Wind,
     WindingGoal,
     Withdraw,
@@ -32,6 +30,7 @@ from magnetosuture_thread.planning.procedure import (
 )
 
 Vector = NDArray[np.float64]
+ESTIMATE_ERROR = 2e-4  # m, by which an estimated thread may be off
 
 
 class GoalTruth:
@@ -84,68 +83,63 @@ class GoalTruth:
         Args:
             ended: whether the nodes take all goals for met; then no wrap may have slipped off either.
         """
-        found = [f"goal {index + 1} in truth: {problem}" for index, problem in sorted(self._problems.items())]
-        goals = self._procedure.goals
-        last = {goal.around: k for k, goal in enumerate(goals) if isinstance(goal, WindingGoal)}
-        for index in last.values() if ended else ():
-            if problem := self._unwound(index, math.pi):
-                found.append(f"at the end, {problem} in truth")
-        return found
+        failures = [f"goal {index + 1} in truth: {problem}" for index, problem in sorted(self._problems.items())]
+        last = {goal.around: k for k, goal in enumerate(self._procedure.goals) if isinstance(goal, WindingGoal)}
+        lost = [self._unwound(index, math.pi) for index in last.values() if ended]
+        return failures + [f"at the end, {problem} in truth" for problem in filter(None, lost)]
 
     def _problem(self, index: int, at: complex, along: complex) -> str:
-        goal = self._procedure.goals[index]
+        goal, problem = self._procedure.goals[index], ""
         if isinstance(goal, PassThrough):
-            made = self._passed[index]
-            return "" if made >= 1 else f"{made} net crossings between {' and '.join(goal.between)}"
+            crossings = self._passed[index]
+            return "" if crossings >= 1 else f"{crossings} net crossings between {' and '.join(goal.between)}"
         if isinstance(goal, WindingGoal):
             problem = self._unwound(index, 0.1)  # rad, by which an estimated thread may be off
-            if isinstance(goal, TakeOff):
-                away = float(shapely.distance(shapely.points(self._thread), self._solid(goal.around)).min())
-                if away < goal.clearance - 2e-4:  # m, by which an estimated thread may be off
-                    problem = f"the thread is {1e3 * away:.2f} mm from {goal.around}"
-            return problem or (self._misplaced(goal, at, along) if isinstance(goal, KeepSide) else "")
         if isinstance(goal, Lay):
-            return self._off_line(goal)
-        if isinstance(goal, BringEnd):
-            off = abs(complex(*self._thread[-1]) - complex(*goal.position))
-            return f"the free end is {1e3 * off:.2f} mm from its place" if off > goal.tolerance + 2e-4 else ""
-        if isinstance(goal, Wait):
-            return ""
-        if isinstance(goal, Tighten):
-            return self._slack(goal) if goal.clearance > 0.0 else ""
-        return self._misplaced(goal, at, along)
+            problem = _beyond(self._off_line(goal), goal.tolerance, "off its line", "the thread")
+        elif isinstance(goal, BringEnd):
+            off = math.dist(self._thread[-1], goal.position)
+            problem = _beyond(off, goal.tolerance, "from its place", "the free end")
+        elif isinstance(goal, TakeOff):
+            away = float(self._distances(goal.around, self._thread).min())
+            if away < goal.clearance - ESTIMATE_ERROR:
+                problem = f"the thread is {1e3 * away:.2f} mm from {goal.around}"
+        elif isinstance(goal, Tighten) and goal.clearance > 0.0:
+            # Of the part that goes around the shape.
+            swept = np.cumsum([0.0, *self._steps(goal.around)])
+            first, last = sorted((int(np.argmin(swept)), int(np.argmax(swept))))
+            away = float(self._distances(goal.around, self._thread[first : last + 1]).max())
+            problem = _beyond(away, goal.clearance, f"from {goal.around}", "the thread")
+        return problem or (self._misplaced(goal, at, along) if isinstance(goal, GoTo | Withdraw | KeepSide) else "")
 
-    def _off_line(self, goal: Lay) -> str:
-        """Return how far thread and line are apart, if that is too far, of 2,000 points on each."""
-        share = np.linspace(0.0, 1.0, 2000)
+    def _off_line(self, goal: Lay) -> float:
+        """Return how far thread and line are apart, of 2,000 points on each [m]."""
+        share, turn = np.linspace(0.0, 1.0, 2000), np.array([1.0, 1.0j])
 
         def spread(points: Vector) -> Vector:
-            along = np.cumsum([0.0, *np.abs(np.diff(points @ np.array([1.0, 1.0j])))])
-            at = share * along[-1]
-            return np.asarray(np.interp(at, along, points[:, 0]) + 1j * np.interp(at, along, points[:, 1]))
+            along = np.cumsum([0.0, *np.abs(np.diff(points @ turn))])
+            return np.asarray(np.interp(share * along[-1], along, points @ turn))
 
         line, thread = spread(np.array(goal.along).reshape(-1, 2)), spread(self._thread)
-        length = float(np.abs(np.diff(self._thread @ np.array([1.0, 1.0j]))).sum())
-        first, last = (
-            [round(1999 * min(1.0, at / length)) for at in goal.stretch]
-            if goal.stretch
-            else sorted(int(np.abs(thread - end).argmin()) for end in (line[0], line[-1]))
-        )
+        length = float(np.abs(np.diff(self._thread @ turn)).sum())
+        if goal.stretch:
+            first, last = (round(1999 * min(1.0, at / length)) for at in goal.stretch)
+        else:
+            first, last = sorted(int(np.abs(thread - end).argmin()) for end in (line[0], line[-1]))
         apart = np.abs(line[:, None] - thread[None, first : last + 1])
-        off = float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
-        return f"the thread is {1e3 * off:.2f} mm off its line" if off > goal.tolerance + 2e-4 else ""
+        return float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
 
     def _unwound(self, index: int, slack: float) -> str:
         """Return how the thread winds about the shape of a goal, if that is off by more than an angle [rad]."""
         goal = self._procedure.goals[index]
         assert isinstance(goal, WindingGoal)
-        wound, least, greatest = self._wound(goal.around), -math.inf, math.inf
+        # From its free end to the needle.
+        wound, least, greatest = -float(np.sum(self._steps(goal.around))), -math.inf, math.inf
         if isinstance(goal, Wrap):
             needed = self._needed(index)
             least, greatest = (needed, math.inf) if goal.sense == "counterclockwise" else (-math.inf, needed)
         elif isinstance(goal, Wind):
-            needed = goal.angle if goal.sense == "counterclockwise" else -goal.angle
-            least, greatest = needed - goal.tolerance, needed + goal.tolerance
+            least, greatest = goal.swept - goal.tolerance, goal.swept + goal.tolerance
         elif isinstance(goal, KeepSide):  # the thread passes the shape at its left in the sense of a clock
             least, greatest = (-2.0 * math.pi, 0.0) if goal.side == "left" else (0.0, 2.0 * math.pi)
         else:
@@ -153,7 +147,7 @@ class GoalTruth:
             least = -greatest
         if least - slack <= wound <= greatest + slack:
             return ""
-        limits = " to ".join(f"{math.degrees(each):.0f}" for each in (least, greatest) if math.isfinite(each))
+        limits = " to ".join(f"{math.degrees(limit):.0f}" for limit in (least, greatest) if math.isfinite(limit))
         return f"the thread winds {math.degrees(wound):.0f} of {limits} degrees about {goal.around}"
 
     def _misplaced(self, goal: GoTo | Withdraw | KeepSide, at: complex, along: complex) -> str:
@@ -167,34 +161,23 @@ class GoalTruth:
             return f"{turned:.2f} rad from its heading" if abs(turned) > 0.35 else ""
         return ""
 
-    def _slack(self, goal: Tighten) -> str:
-        """Return how far the part of the thread that goes around a shape is from it, if that is too far."""
-        swept = np.cumsum([0.0, *self._steps(goal.around)])
-        first, last = sorted((int(np.argmin(swept)), int(np.argmax(swept))))
-        part, solid = shapely.points(self._thread[first : last + 1]), self._solid(goal.around)
-        away = float(shapely.distance(part, solid).max())
-        return f"the thread is {1e3 * away:.2f} mm from {goal.around}" if away > goal.clearance + 2e-4 else ""
-
     def _needed(self, index: int) -> float:
         """Return the angle by which the thread is to wind about a wrap's shape once that is met [rad]."""
         needed, name = 0.0, getattr(self._procedure.goals[index], "around", "")
         for goal in self._procedure.goals[: index + 1]:
-            if isinstance(goal, Wrap | Wind) and goal.around == name:
-                turned = goal.angle if goal.sense == "counterclockwise" else -goal.angle
-                needed = turned + (needed if isinstance(goal, Wrap) else 0.0)
-            elif isinstance(goal, WindingGoal) and goal.around == name:
-                needed = 0.0
+            if isinstance(goal, WindingGoal) and goal.around == name:
+                swept = goal.swept if isinstance(goal, Wrap | Wind) else 0.0
+                needed = swept + (needed if isinstance(goal, Wrap) else 0.0)
         return needed
-
-    def _wound(self, name: str) -> float:
-        """Return the angle by which the thread winds about a shape, from its free end to the needle [rad]."""
-        return -float(np.sum(self._steps(name)))
 
     def _steps(self, name: str) -> Vector:
         """Return the angles that the pieces of the thread sweep about a shape, from the needle on [rad]."""
         centre = self._solid(name).centroid
         seen = self._thread @ np.array([1.0, 1.0j]) - complex(centre.x, centre.y)
         return np.asarray(np.angle(seen[1:] / seen[:-1]))
+
+    def _distances(self, name: str, points: Vector) -> Vector:
+        return np.asarray(shapely.distance(shapely.points(points), self._solid(name)))
 
     def _solid(self, name: str) -> shapely.Geometry:
         shapes = {shape.name: shape.solid for shape in self._scene.shapes}
@@ -211,27 +194,20 @@ class GoalTruth:
         rings = shapely.get_parts(first.boundary if first.geom_type == "Polygon" else first)
         share = np.linspace(0.0, 1.0, 4000, endpoint=False)
         sampled = [shapely.line_interpolate_point(ring, share, normalized=True) for ring in rings]
-        least = min(float(shapely.distance(points, second).min()) for points in sampled)
-        return [line for points in sampled for line in self._lines_between(points, second, least, goal)]
-
-    @staticmethod
-    def _lines_between(
-        points: Any, second: shapely.Geometry, least: float, goal: PassThrough
-    ) -> list[tuple[complex, complex]]:
-        """Return the lines from points around a shape to another, where they are nearest; see `_gaps`."""
-        near = shapely.distance(points, second) <= 1.001 * least + 1e-7
-        offset = int(np.argmin(near))  # a point that is not near, to begin with
-        runs = np.split(np.roll(np.arange(len(near)), -offset), np.flatnonzero(np.diff(np.roll(near, -offset))) + 1)
-        found, wanted = [], complex(*goal.direction) / abs(complex(*goal.direction))
-        for run in runs:
-            if not near[run[0]]:
-                continue
-            (x, y), (u, v) = shapely.get_coordinates(shapely.shortest_line(points[run[len(run) // 2]], second))
-            begin, along = complex(x, y), complex(u - x, v - y)
-            share = (wanted / (1j * along / abs(along))).real
-            if abs(share) >= 0.5:
-                found.append((begin, along) if share > 0.0 else (begin + along, -along))
-        return found
+        distances = [shapely.distance(points, second) for points in sampled]
+        least, direction, lines = np.min(distances), complex(*goal.direction) / abs(complex(*goal.direction)), []
+        for points, distance in zip(sampled, distances, strict=True):
+            near = distance <= 1.001 * least + 1e-7
+            starts = np.flatnonzero(near & ~np.roll(near, 1)) if not near.all() else [0]
+            for start in starts:
+                count = int(np.argmin(np.roll(near, -start))) or len(near)  # of the run
+                middle = points[(start + count // 2) % len(near)]
+                (x, y), (u, v) = shapely.get_coordinates(shapely.shortest_line(middle, second))
+                begin, along = complex(x, y), complex(u - x, v - y)
+                part = (direction / (1j * along / abs(along))).real
+                if abs(part) >= 0.5:
+                    lines.append((begin, along) if part > 0.0 else (begin + along, -along))
+        return lines
 
 
 def _crosses(begin: complex, along: complex, before: complex, after: complex) -> int:
@@ -244,3 +220,8 @@ def _crosses(begin: complex, along: complex, before: complex, after: complex) ->
         return 0
     where = first + (then - first) * (first.imag / (first.imag - then.imag))
     return (1 if then.imag >= 0.0 else -1) if 0.0 <= where.real <= 1.0 else 0
+
+
+def _beyond(off: float, limit: float, what: str, whose: str) -> str:
+    """Return in words what is farther off than a limit and the error of an estimated thread [m]."""
+    return f"{whose} is {1e3 * off:.2f} mm {what}" if off > limit + ESTIMATE_ERROR else ""

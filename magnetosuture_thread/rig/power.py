@@ -7,6 +7,7 @@ lost the processor. A driver takes such a board for dead.
 
 from __future__ import annotations
 
+import binascii
 import math
 import os
 import select
@@ -14,7 +15,7 @@ import struct
 import threading
 import time
 import tty
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from enum import IntEnum
@@ -61,11 +62,11 @@ ARGUMENTS: dict[int, str] = {
 }
 
 FULL = 32767  # duty of the whole supply voltage
-FACTORY_LIMIT = 3000  # in units of 10 mA
+FACTORY_LIMITS = (3000, 3000)  # of the currents, in units of 10 mA
 
 
 class RoboClawBoard:
-    """What a board does with the packets for it, and what its coils do with the duties. Time comes in [s].
+    """A board: its answers to packets, and the currents that its duties give. Time comes in [s].
 
     A coil's current follows L di/dt = d U - R i, with the duty d from -1 to 1, the supply's voltage U, and
     resistance R and inductance L of the coil; the board takes back the duty of a coil at its current limit.
@@ -97,15 +98,12 @@ class RoboClawBoard:
     def __init__(
         self, address: int = 0x80, supply: float = 24.0, resistance: float = 1.0, inductance: float = 0.01
     ) -> None:
-        self.address = address
-        self.supply, self.resistance, self.inductance = supply, resistance, inductance
-        self.duties = (0, 0)
-        self.currents = (0.0, 0.0)
-        self.timeout, self.limits = 0, [FACTORY_LIMIT, FACTORY_LIMIT]
+        self.address, self.supply, self.resistance, self.inductance = address, supply, resistance, inductance
+        self.duties, self.currents = (0, 0), (0.0, 0.0)
+        self.timeout, self.limits = 0, [*FACTORY_LIMITS]
         self.errors = self.warnings = 0
-        self.ignored: set[int] = set()
+        self.ignored, self.broken = set[int](), set[int]()
         self.mismeasured = 0.0
-        self.broken: set[int] = set()
         self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=10_000)
         self.heard = -math.inf
         self._buffer, self._received, self._time = b"", -math.inf, -math.inf
@@ -145,28 +143,18 @@ class RoboClawBoard:
     def power_cycle(self) -> None:
         """Let its supply go and come back at once: duties zero, timeout and limits as it was delivered."""
         self._set((0, 0), self._time)
-        self.timeout, self.limits = 0, [FACTORY_LIMIT, FACTORY_LIMIT]
+        self.timeout, self.limits = 0, [*FACTORY_LIMITS]
         self._buffer = b""
-
-    def _output(self, channel: int) -> int:
-        """Return what is left of a duty where its coil is at the limit."""
-        duty, limit = self.duties[channel], 0.01 * self.limits[channel]
-        if abs(self.currents[channel]) < 0.999 * limit or duty * self.currents[channel] <= 0.0:
-            return duty
-        most = FULL * limit * self.resistance / self.supply
-        return round(max(-most, min(most, duty)))
 
     def _move(self, time: float) -> None:
         if time <= self._time:
             return
-        share = math.exp(-(time - self._time) * self.resistance / self.inductance)
-        moved = []
-        for channel, (current, duty, limit) in enumerate(zip(self.currents, self.duties, self.limits, strict=True)):
-            goal = duty / FULL * self.supply / self.resistance
-            limited = max(-0.01 * limit, min(0.01 * limit, goal + (current - goal) * share))
-            moved.append(0.0 if channel in self.broken else limited)
-        self.currents = (moved[0], moved[1])
-        self._time = time
+        share, currents = math.exp(-(time - self._time) * self.resistance / self.inductance), [0.0, 0.0]
+        for channel in {0, 1} - self.broken:
+            current, limit = self.currents[channel], 0.01 * self.limits[channel]
+            goal = self.duties[channel] / FULL * self.supply / self.resistance
+            currents[channel] = max(-limit, min(limit, goal + (current - goal) * share))
+        self.currents, self._time = (currents[0], currents[1]), time
 
     def _set(self, duties: tuple[int, int], time: float) -> None:
         if duties != self.duties:
@@ -174,6 +162,7 @@ class RoboClawBoard:
             self.timeline.append((time, duties))
 
     def _handle(self, packet: bytes) -> bytes:
+        """Return the answer to a packet, once it is done what it asks for."""
         command = packet[1]
         if command not in ARGUMENTS:
             self.heard = self._time
@@ -181,18 +170,16 @@ class RoboClawBoard:
         if checksum(packet[:-2]) != struct.unpack(">H", packet[-2:])[0]:
             return b""
         self.heard = self._time
-        if command not in self.ignored:
-            self._obey(command, struct.unpack(ARGUMENTS[command], packet[2:-2]))
-        return ACKNOWLEDGED
-
-    def _obey(self, command: int, values: tuple[int, ...]) -> None:
+        values = struct.unpack(ARGUMENTS[command], packet[2:-2])
+        if command in self.ignored or (command == Command.SET_DUTIES and self.errors):
+            return ACKNOWLEDGED
         if command == Command.SET_TIMEOUT:
-            self.timeout = values[0]
+            (self.timeout,) = values
         elif command == Command.SET_DUTIES:
-            if not self.errors:
-                self._set((values[0], values[1]), self._time)
+            self._set(values, self._time)
         else:
             self.limits[command - Command.SET_LIMIT_1] = values[0]
+        return ACKNOWLEDGED
 
     def _data(self, command: int) -> bytes:
         """Return what the answer to a question says."""
@@ -201,14 +188,22 @@ class RoboClawBoard:
             Command.GET_TIMEOUT: bytes((self.timeout,)),
             Command.GET_VERSION: b"RoboClaw simulated 2x15A v4.2.4\n\x00",
             Command.GET_MAIN_VOLTAGE: struct.pack(">H", volts),
-            Command.GET_DUTIES: struct.pack(">hh", self._output(0), self._output(1)),
-            Command.GET_CURRENTS: struct.pack(">hh", self._reported(0), self._reported(1)),
+            Command.GET_DUTIES: struct.pack(">hh", *map(self._output, (0, 1))),
+            Command.GET_CURRENTS: struct.pack(">hh", *map(self._reported, (0, 1))),
             Command.GET_STATUS: struct.pack(">I", self.warnings << 16 | self.errors),
             Command.GET_VOLTAGES: struct.pack(">HH", volts, 50),
             Command.GET_LIMIT_1: struct.pack(">II", self.limits[0], 0),
             Command.GET_LIMIT_2: struct.pack(">II", self.limits[1], 0),
         }
         return answers[command]
+
+    def _output(self, channel: int) -> int:
+        """Return what is left of a duty where its coil is at the limit."""
+        duty, limit = self.duties[channel], 0.01 * self.limits[channel]
+        if abs(self.currents[channel]) < 0.999 * limit or duty * self.currents[channel] <= 0.0:
+            return duty
+        most = FULL * limit * self.resistance / self.supply
+        return round(max(-most, min(most, duty)))
 
     def _reported(self, channel: int) -> int:
         """Return the current that it reports, in units of 10 mA."""
@@ -225,12 +220,7 @@ def checksum(data: bytes) -> int:
     >>> hex(checksum(b"123456789"))
     '0x31c3'
     """
-    crc = 0
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
-    return crc
+    return binascii.crc_hqx(data, 0)
 
 
 def answer(address: int, command: int, data: bytes) -> bytes:
@@ -238,12 +228,8 @@ def answer(address: int, command: int, data: bytes) -> bytes:
     return data + struct.pack(">H", checksum(bytes((address, command)) + data))
 
 
-TIMEOUT = 5.0  # s for the boards to be taken away
-NOT_OPEN = "the simulated boards are not open"
-
-
 class Line:
-    """Serves boards on a pseudo-terminal, in a thread; the path is a symbolic link to it.
+    """Serves boards on a pseudo-terminal, by a worker; the path is a symbolic link to it.
 
     It stands in for hardware, and so, unlike the rest of the rig, it reads a clock and waits.
 
@@ -258,7 +244,7 @@ class Line:
     def __init__(self, path: str | Path, boards: Sequence[RoboClawBoard]) -> None:
         self.path, self.boards, self.lock = Path(path), tuple(boards), threading.Lock()
         self._ends = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._worker: threading.Thread | None = None
         self._host = self._device = -1
 
     def plug(self) -> None:
@@ -267,29 +253,34 @@ class Line:
         Raises:
             ConfigurationError: the path cannot be a symbolic link.
         """
-        if self._thread is not None:
+        if self._worker is not None:
             return
         self._host, self._device = os.openpty()
         # Held open here, so that the line does not hang up while nobody else has it.
         tty.setraw(self._device)
         os.set_blocking(self._host, False)
         try:
-            self._link(os.ttyname(self._device))
+            if self.path.exists() and not self.path.is_symlink():
+                raise FileExistsError(17, "there is something else")
+            link = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+            link.unlink(missing_ok=True)
+            link.symlink_to(os.ttyname(self._device))
+            link.replace(self.path)
         except OSError as error:
             self._shut()
             expectation = f"a path for a symbolic link ({error.strerror})"
             raise ConfigurationError("rig_simulator.power_stage_ports", str(self.path), expectation) from None
         self._ends.clear()
-        self._thread = threading.Thread(target=self._serve, name=f"line {self.path}", daemon=True)
-        self._thread.start()
+        self._worker = threading.Thread(target=self._serve, name=f"line {self.path}", daemon=True)
+        self._worker.start()
 
     def unplug(self) -> None:
         """Remove the line; its boards keep their state. No effect if there is none."""
-        if self._thread is None:
+        if self._worker is None:
             return
         self._ends.set()
-        self._thread.join()
-        self._thread = None
+        self._worker.join()
+        self._worker = None
         with suppress(OSError):
             if os.readlink(self.path) == os.ttyname(self._device):  # else somebody else has put his own there
                 self.path.unlink()
@@ -300,14 +291,6 @@ class Line:
         with self.lock:
             for board in self.boards:
                 board.advance(time.monotonic())
-
-    def _link(self, name: str) -> None:
-        if self.path.exists() and not self.path.is_symlink():
-            raise FileExistsError(17, "there is something else")
-        new = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        new.unlink(missing_ok=True)
-        new.symlink_to(name)
-        new.replace(self.path)
 
     def _shut(self) -> None:
         os.close(self._host)
@@ -348,13 +331,10 @@ class PowerStage:
     """
 
     def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
-        by_path: dict[str, list[RoboClawBoard]] = defaultdict(list)
-        self.boards = []
-        for path, address in zip(ports, board_addresses(len(ports)), strict=True):
-            board = RoboClawBoard(address, supply, resistance, inductance)
-            by_path[path].append(board)
-            self.boards.append(board)
-        self.lines = [Line(path, boards) for path, boards in by_path.items()]
+        coil = supply, resistance, inductance
+        self.boards = [RoboClawBoard(address, *coil) for address in board_addresses(len(ports))]
+        paths = list(zip(ports, self.boards, strict=True))
+        self.lines = [Line(path, [board for at, board in paths if at == path]) for path in dict.fromkeys(ports)]
 
     def open(self) -> None:
         """Let the boards be found.
@@ -397,15 +377,9 @@ class StageProcess:
         self._pipe: Connection | None = None
 
     @property
-    def pid(self) -> int:
-        """Number of the process.
-
-        Raises:
-            GraphError: there is none.
-        """
-        if self._process is None or self._process.pid is None:
-            raise GraphError(NOT_OPEN)
-        return self._process.pid
+    def pid(self) -> int | None:
+        """Number of the process, None without one."""
+        return self._process.pid if self._process else None
 
     def open(self) -> None:
         """Start the process, and wait until its boards can be found.
@@ -428,7 +402,7 @@ class StageProcess:
         if self._process is None or self._pipe is None:
             return
         self._pipe.close()  # which ends it
-        self._process.join(TIMEOUT)
+        self._process.join(5.0)  # s
         self._process.kill()
         self._process.join()
         self._process = self._pipe = None
@@ -437,7 +411,7 @@ class StageProcess:
         """Return the coils' currents now, shape (2 boards,) [A].
 
         Raises:
-            GraphError: the process ended.
+            GraphError: the boards are not open, or the process ended.
         """
         if self._pipe is not None:
             with suppress(OSError):  # receiving tells
@@ -446,7 +420,7 @@ class StageProcess:
 
     def _receive(self) -> Any:
         if self._pipe is None or self._process is None:
-            raise GraphError(NOT_OPEN)
+            raise GraphError("the simulated boards are not open")
         try:
             return self._pipe.recv()
         except (EOFError, OSError):

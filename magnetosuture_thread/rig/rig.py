@@ -1,8 +1,9 @@
-"""The simulated rig: currents in, frames out."""
+"""The simulated rig: currents in, frames out; and its faults."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -10,17 +11,94 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.packing import Outputs, Stamp, packed_path, packed_pose_stamped, packed_wrench
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import find_collision
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.rig.camera import Cover, DishCamera, Image
-from magnetosuture_thread.rig.faults import COIL_STUCK
-from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.rig.settings import COVERS, KINDS, Fault, RigSettings
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
 
 Vector = NDArray[np.float64]
 
 RELEASE_TIME = 1.0  # s without currents asked for, after which a rig with a problem tries again
+
+
+class FaultSchedule:
+    """All faults of a run, and what those in force do to a frame.
+
+    Args:
+        faults: in any order; they may overlap.
+        dish_diameter: [m]
+        needle_length: [m]
+        seed: of where glare, hand and tool lie.
+    """
+
+    def __init__(self, faults: Sequence[Fault], dish_diameter: float, needle_length: float, seed: int) -> None:
+        self.faults, self.dish_diameter = tuple(faults), dish_diameter
+        self._needle, self._seed = needle_length, seed
+
+    def add(self, fault: Fault) -> None:
+        """Take one more fault, and forget those that are over."""
+        self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-100:]
+
+    def kinds(self, time: float) -> frozenset[str]:
+        """Return the kinds in force at a time [s]."""
+        return frozenset(fault.kind for fault in self.faults if fault.holds(time))
+
+    def lifted(self, time: float) -> Vector:
+        """Return by how much the needle has been carried out of the dish, shape (2,) [m]."""
+        for fault in self.faults:
+            if fault.kind == "needle_out" and fault.holds(time):
+                # It is carried over the rim in 0.6 s.
+                up, down = (min(1.0, left / 0.6) for left in (time - fault.start, fault.start + fault.duration - time))
+                along, _ = _axes(self._random(fault).uniform(0.0, 2.0 * np.pi))
+                return np.asarray(min(up, down) * 1.2 * self.dish_diameter * along)
+        return np.zeros(2)
+
+    def covers(self, time: float, tail: Points, tip: Points) -> tuple[Cover, ...]:
+        """Return what lies between the dish and the camera.
+
+        Glare, hand and tool lie on some place of the needle and move a little with every frame.
+
+        Args:
+            time: [s].
+            tail: of the needle, shape (2,) [m].
+            tip: shape (2,) [m].
+        """
+        return tuple(
+            self._cover(fault, time, tail, tip) for fault in self.faults if fault.kind in COVERS and fault.holds(time)
+        )
+
+    def _cover(self, fault: Fault, time: float, tail: Points, tip: Points) -> Cover:
+        random = self._random(fault)
+        place = tail + random.uniform(0.0, 1.0) * (tip - tail)
+        angle = random.uniform(0.0, 2.0 * np.pi)
+        along, across = _axes(angle)
+        if fault.kind == "glare":  # an ellipse, whose radius is 0.3 to 0.55 of the needle's length
+            radius, turn = self._needle * random.uniform(0.3, 0.55), np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+            less = random.uniform(0.5, 1.0) * radius
+            outline = place + radius * np.cos(turn)[:, None] * along + less * np.sin(turn)[:, None] * across
+            return Cover(outline, (265.0, 265.0, 265.0), blur_px=4.0)
+        # A strip that comes in from far away and ends, rounded, beyond the place.
+        is_hand = fault.kind == "hand"
+        width, along, across = (0.28 if is_hand else 0.07) * self.dish_diameter, -along, -across
+        turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 24)
+        sway = 0.03 * self.dish_diameter * np.sin(5.0 * (time - fault.start) + angle)
+        end = place + 0.3 * width * along + sway * across
+        cap = end + 0.5 * width * (np.cos(turn)[:, None] * along + np.sin(turn)[:, None] * across)
+        back = end - 3.0 * self.dish_diameter * along
+        outline = np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across])
+        bgr = (120.0, 145.0, 195.0) if is_hand else (115.0, 112.0, 108.0)  # skin, or steel
+        return Cover(outline, bgr, blur_px=3.0 if is_hand else 1.5)
+
+    def _random(self, fault: Fault) -> np.random.Generator:
+        """Return chances that are a fault's own, whatever others there are."""
+        return np.random.default_rng((self._seed, KINDS.index(fault.kind), round(1e6 * fault.start)))
+
+
+def _axes(angle: float) -> tuple[Vector, Vector]:
+    """Return the unit vectors along an angle [rad] and to its left."""
+    return np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
 
 
 @dataclass(frozen=True)
@@ -77,6 +155,7 @@ class Rig:
         currents: in force, shape (m,) [A].
         began: time of the first current that was not zero, inf before [s].
         problem: why everything stays where it is; empty if it does not.
+        dynamics: needle and thread.
         is_watched: whether the thread moves before the first current; a node waits for a model that follows it.
 
     Raises:
@@ -84,23 +163,17 @@ class Rig:
     """
 
     def __init__(
-        self,
-        settings: RigSettings,
-        scene: Scene,
-        *,
-        max_time: float = math.inf,
-        max_iterations: float = math.inf,
+        self, settings: RigSettings, scene: Scene, *, max_time: float = math.inf, max_iterations: float = math.inf
     ) -> None:
         settings.check_scene(scene)
         self._settings, self.scene = settings, scene
-        self._dynamics = settings.dynamics(scene)
+        self.dynamics = settings.dynamics(scene)
         self._camera: DishCamera | None = None  # drawn when it is needed first, which takes a second
-        self.faults = settings.schedule(scene)
+        faults = [Fault.parse(text) for text in settings.faults]
+        self.faults = FaultSchedule(faults, scene.dish.diameter, settings.needle_length, settings.seed)
         self._random = np.random.default_rng(settings.seed + 1)
-        self.time = 0.0
-        self.began = math.inf
+        self.time, self.began, self._applied_at = 0.0, math.inf, 0.0
         self.currents = np.zeros(len(settings.coil_angles))
-        self._applied_at = 0.0
         self._max_time, self._max_iterations = max_time, max_iterations
         self.problem, self.is_watched = "", True
         self._asked_at = -math.inf  # last time that currents were asked for since the problem
@@ -132,13 +205,12 @@ class Rig:
             return
         # A thread around a post that stays may cut its edge by a chord, which is no reason to refuse.
         new = replace(scene, shapes=tuple(shape for shape in scene.shapes if shape not in self.scene.shapes))
-        for name, points in {"needle": self._dynamics.body, "thread": self._dynamics.thread}.items():
+        for name, points in {"needle": self.dynamics.body, "thread": self.dynamics.thread}.items():
             if what := find_collision(new, points, holes=False):
                 raise InvalidInputError("scene", f"{what} where the {name} is", "shapes off needle and thread")
         camera = None if self._camera is None else self._settings.camera(scene)
-        self._dynamics.set_surface(self._settings.surface(scene))
-        self.scene, self._camera = scene, camera
-        self.faults.set_dish(scene.dish.diameter)
+        self.dynamics.set_surface(self._settings.surface(scene))
+        self.scene, self._camera, self.faults.dish_diameter = scene, camera, scene.dish.diameter
 
     def apply(self, currents: Vector, time: float) -> None:
         """Set the coils' currents from a time on; until then the last ones are in force.
@@ -155,7 +227,7 @@ class Rig:
             raise InvalidInputError("rig/currents.current", currents.tolist(), expected)
         self.advance(time)
         limit = self._settings.coil_max_current
-        currents = np.minimum(np.maximum(currents, -limit), limit)
+        currents = np.clip(currents, -limit, limit)
         if self.problem:
             if not np.any(currents):
                 return
@@ -165,10 +237,7 @@ class Rig:
             self.problem = ""
         if np.any(currents):
             self.began = min(self.began, self.time)
-        stuck = self.currents[0]
-        self.currents = currents.copy()
-        if COIL_STUCK in self.faults.kinds(self.running):
-            self.currents[0] = stuck
+        self._set_currents(currents)
         self._applied_at = min(time, self.time)
 
     @property
@@ -189,7 +258,8 @@ class Rig:
         off_at = max(self.time, self._applied_at + self._settings.driver_timeout)
         try:
             if self.began == math.inf:  # what it has no time for is left out, as nothing else waits for the thread
-                self._hold(min(time, limit) - self.time)
+                if (span := min(time, limit) - self.time) > 0.0 and self.is_watched:
+                    self.dynamics.drive(self.dynamics.tail, self.dynamics.heading, span)
                 self.time = max(self.time, time)
                 return
             time = min(time, limit)
@@ -205,14 +275,11 @@ class Rig:
 
     def switch_off(self) -> None:
         """Set all currents to zero, but that of a stuck coil."""
-        stuck = self.currents[0] if COIL_STUCK in self.faults.kinds(self.running) else 0.0
-        self.currents = np.zeros_like(self.currents)
-        self.currents[0] = stuck
+        self._set_currents(np.zeros_like(self.currents))
 
-    def _hold(self, span: float) -> None:
-        """Let the thread alone move for a time [s], if somebody watches."""
-        if span > 0.0 and self.is_watched:
-            self._dynamics.drive(self._dynamics.tail, self._dynamics.heading, span)
+    def _set_currents(self, currents: Vector) -> None:
+        stuck = self.currents[:1] if "coil_stuck" in self.faults.kinds(self.running) else currents[:1]
+        self.currents = np.concatenate([stuck, currents[1:]])
 
     def _move(self, time: float) -> bool:
         """Move up to a time [s]; return whether it was reached within the iterations."""
@@ -220,7 +287,7 @@ class Rig:
         # ROS times resolve 1 ns; what is nearer to the rig's own time waits for the next call.
         if span < 1e-9:
             return True
-        moved = self._dynamics.step(self.currents, span, self._max_iterations)
+        moved = self.dynamics.step(self.currents, span, self._max_iterations)
         self.time = time if moved >= span else self.time + moved
         return moved >= span
 
@@ -231,20 +298,10 @@ class Rig:
 
     @property
     def status(self) -> str:
-        """What goes on, for a person."""
+        """The state in words, for a person."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
         text = "running" if self.running >= 0.0 else "the needle is held until the first current"
         return f"{text}, with {faults}" if faults else text
-
-    @property
-    def tension(self) -> Vector:
-        """Tension of each segment of the thread, shape (n,) [N]."""
-        return self._dynamics.tension
-
-    @property
-    def thread_pull(self) -> Vector:
-        """Force of the thread on the needle, at the tail, shape (2,) [N]."""
-        return self._dynamics.thread_pull
 
     def look(self, time: float, *, rendered: bool = True) -> RigFrame:
         """Take a frame at a time since the start [s].
@@ -254,19 +311,20 @@ class Rig:
             rendered: whether the picture is wanted too, which takes most of the time.
         """
         self.advance(time)
-        faults, dynamics, running = self.faults, self._dynamics, self.running
-        away = faults.lifted(running)
+        dynamics, running, chance = self.dynamics, self.running, float(self._random.uniform())
+        kinds, away = self.faults.kinds(running), self.faults.lifted(running)
         tail, thread = dynamics.tail + away, dynamics.thread + away
-        lost = faults.drops(running, float(self._random.uniform()))
-        covers = faults.covers(running, tail, dynamics.tip + away)
         truth = tail, dynamics.heading, thread, dynamics.thread_pull, dynamics.thread_moment
-        frame = RigFrame(self.time, None, faults.lateness(running), *truth, lost, covers, faults.gain(running))
+        lost = "camera_stopped" in kinds or ("dropped_frames" in kinds and chance < 0.5)
+        gain = (0.3 if "dim" in kinds else 1.0) * (1.9 if "overexposed" in kinds else 1.0)
+        covers, lateness = self.faults.covers(running, tail, dynamics.tip + away), 0.12 * ("late_frames" in kinds)
+        frame = RigFrame(self.time, None, lateness, *truth, lost, covers, gain)
         return self.render(frame) if rendered else frame
 
     def render(self, frame: RigFrame) -> RigFrame:
         """Return a frame with its picture, where it does not get lost.
 
-        It may be called in another thread than the rest, by one at a time.
+        It may be called by another worker than the rest, by one at a time.
         """
         if frame.lost:
             return frame
@@ -275,7 +333,7 @@ class Rig:
 
 
 def ground_truth_outputs(stamp: Stamp, frame: RigFrame) -> Outputs:
-    """Give where needle and thread of a simulation are, and how the thread pulls."""
+    """Yield the ground truth as messages: needle, thread, and how the thread pulls."""
     yield interface.GROUND_TRUTH_NEEDLE, packed_pose_stamped(stamp, frame.tail, frame.heading)
     yield interface.GROUND_TRUTH_THREAD, packed_path(stamp, frame.thread)
     yield interface.GROUND_TRUTH_PULL, packed_wrench(stamp, frame.pull, frame.moment)

@@ -1,4 +1,4 @@
-"""Settings of the simulated rig."""
+"""Settings of the simulated rig, and the faults that may be asked of it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,74 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import find_collision
-from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting, Look
-from magnetosuture_thread.rig.faults import Fault, FaultSchedule
-from magnetosuture_thread.rig.mechanics.contact import Surface
-from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
-from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
-from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
+from magnetosuture_thread.geometry.scene import Scene, find_collision
+from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting
+from magnetosuture_thread.rig.contact import Surface
+from magnetosuture_thread.rig.dynamics import CoilField, NeedleBody, RigDynamics
 from magnetosuture_thread.rig.power import StageProcess
+from magnetosuture_thread.rig.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import quantity
-from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+
+COVERS = ("glare", "hand", "tool")
+KINDS = (*COVERS, "dim", "overexposed", "dropped_frames", "late_frames", "camera_stopped", "needle_out", "coil_stuck")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes:
+        kind: one of `KINDS`.
+        start: when it begins [s].
+        duration: how long it lasts [s].
+    """
+
+    kind: str
+    start: float
+    duration: float
+
+    @classmethod
+    def parse(cls, text: str) -> Fault:
+        """Read `KIND START DURATION`, in seconds.
+
+        >>> Fault.parse("glare 2 0.5")
+        Fault(kind='glare', start=2.0, duration=0.5)
+
+        Raises:
+            ConfigurationError: it is something else.
+        """
+        words = text.split()
+        try:
+            start, duration = (float(word) for word in words[1:])
+        except ValueError:
+            start = duration = float("nan")
+        if not words or words[0] not in KINDS or not (0.0 <= start < 1e6 and 0.0 < duration < 1e6):
+            expectation = f"KIND START DURATION in seconds, with a kind of {', '.join(KINDS)}"
+            raise ConfigurationError("rig_simulator.faults", repr(text), expectation)
+        return cls(words[0], start, duration)
+
+    @classmethod
+    def requested(cls, text: str, time: float) -> Fault:
+        """Read `KIND DURATION` as a fault that begins at a time [s].
+
+        >>> Fault.requested("glare 0.5", 7.0)
+        Fault(kind='glare', start=7.0, duration=0.5)
+
+        Raises:
+            InvalidInputError: it is something else.
+        """
+        kind, _, duration = text.partition(" ")
+        try:
+            return cls.parse(f"{kind} {time!r} {duration}")
+        except ConfigurationError:
+            expectation = f"KIND DURATION, with a kind of {', '.join(KINDS)}"
+            raise InvalidInputError("rig/fault", repr(text), expectation) from None
+
+    def holds(self, time: float) -> bool:
+        """Return whether the fault is in force at a time [s]."""
+        return self.start <= time < self.start + self.duration
 
 
 @dataclass(frozen=True)
@@ -38,49 +94,33 @@ class RigSettings(
 
     GROUP: ClassVar[str] = "rig_simulator"
 
-    rate: float = quantity(
-        1.0, "how much faster than real time /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0
-    )
+    rate: float = quantity(1.0, "how much faster /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0)
     seed: int = quantity(0, "of dust, sensor noise and faults", minimum=0, maximum=2**31 - 1)
-    faults: tuple[str, ...] = quantity(
-        (), "what goes wrong: KIND START DURATION each, in seconds since the first current"
-    )
+    faults: tuple[str, ...] = quantity((), "what goes wrong: KIND START DURATION each, in s since the first current")
 
     obstacle_looks: tuple[str, ...] = quantity(
         (), f"of what each shape of the scene seems to be made, in order: {', '.join(LOOKS)}; none given: by its kind"
     )
 
-    coil_distance: float = quantity(
-        0.05, "from the dish's centre to the middle of a coil", unit="m", minimum=0.01, maximum=1.0
-    )
+    coil_distance: float = quantity(0.05, "of a coil's middle from the dish's", unit="m", minimum=0.01, maximum=1.0)
     coil_radius: float = quantity(0.025, "mean radius of the windings", unit="m", minimum=0.002, maximum=0.5)
     coil_length: float = quantity(0.03, "of the winding along its axis", unit="m", minimum=0.0, maximum=0.5)
     coil_turns: float = quantity(480.0, "of a coil", minimum=1.0, maximum=1e5)
-    coil_max_current: float = quantity(
-        30.0, "that the power stage gives, in either direction", unit="A", minimum=0.01, maximum=1000.0
-    )
+    coil_max_current: float = quantity(30.0, "of the power stage, either way", unit="A", minimum=0.01, maximum=1000.0)
 
     power_stage: str = quantity(
         "topic",
-        "where the currents come from: a topic, or simulated RoboClaw boards, which a driver finds at ports",
+        "where currents come from: a topic, or simulated RoboClaw boards at ports",
         choices=("topic", "roboclaw"),
     )
-    power_stage_ports: tuple[str, ...] = quantity(
-        (), "path at which each board is to be found, with two coils in a row; for power_stage roboclaw"
-    )
+    power_stage_ports: tuple[str, ...] = quantity((), "path of each board, with two coils in a row, for roboclaw")
     coil_resistance: float = quantity(1.0, "of a coil on a board", unit="ohm", minimum=0.01, maximum=1000.0)
     coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
     supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
 
-    needle_magnetisation: float = quantity(
-        1.0e6, "of the needle, NdFeB, along its body", unit="A/m", minimum=1e3, maximum=2e6
-    )
+    needle_magnetisation: float = quantity(1e6, "along its body, of NdFeB", unit="A/m", minimum=1e3, maximum=2e6)
     needle_start: tuple[float, ...] = quantity(
-        (0.003, -0.004, 0.0),
-        "x [m], y [m] of the tail and heading [rad] at the start",
-        minimum=-7.0,
-        maximum=7.0,
-        multiple=3,
+        (0.003, -0.004, 0.0), "x, y of the tail [m] and heading [rad] at first", minimum=-7.0, maximum=7.0, multiple=3
     )
 
     thread_diameter: float = quantity(60e-6, "of the thread", unit="m", minimum=1e-6, maximum=0.005)
@@ -93,10 +133,7 @@ class RigSettings(
     )
     thread_drag_along: float = quantity(0.487, "the same along it", unit="Pa s", minimum=1e-6, maximum=1e3)
     thread_friction: float = quantity(
-        0.0,
-        "coefficient of friction of the thread on shapes, wall and itself, whatever the scene says",
-        minimum=0.0,
-        maximum=2.0,
+        0.0, "coefficient of the thread on shapes, wall and itself, whatever the scene says", minimum=0.0, maximum=2.0
     )
     thread_start_curvature: float = quantity(
         0.0, "of the arc in which the thread lies behind the needle at the start", unit="1/m", minimum=-1e4, maximum=1e4
@@ -136,29 +173,24 @@ class RigSettings(
             ConfigurationError: needle or thread would start in the wall or in a shape, or the looks are those of
                 another number of shapes, or the thread would start on itself where the scene does not allow it.
         """
-        count = len(scene.shapes)
-        if self.obstacle_looks and len(self.obstacle_looks) != count:
-            raise self.refused("obstacle_looks", f"one for each of the scene's {count} shapes, or none")
-        at = np.linspace(0.0, 1.0, 100)
-        turn = abs(self.thread_start_curvature) * self.thread_length
-        if turn >= 2.0 * math.pi and scene.dish.has_self_contact(self.thread_diameter):
-            most = 2.0 * math.pi / self.thread_length
+        if self.obstacle_looks and len(self.obstacle_looks) != len(scene.shapes):
+            raise self.refused("obstacle_looks", f"one for each of the scene's {len(scene.shapes)} shapes, or none")
+        at, most = np.linspace(0.0, 1.0, 100), 2.0 * math.pi / self.thread_length
+        if abs(self.thread_start_curvature) >= most and scene.dish.has_self_contact(self.thread_diameter):
             expected = f"less than {most:.4g} 1/m to either side: the thread would lie on itself"
             raise self.refused("thread_start_curvature", expected)
         x, y, heading = self.needle_start
         needle, _ = needle_axis(np.array([x, y]), heading, self.needle_length, self.needle_curvature, at)
         for name, points in {"a needle": needle, "a thread": self.thread_at_start(at)}.items():
-            what = find_collision(scene, points, holes=False)
-            if what:
+            if what := find_collision(scene, points, holes=False):
                 start = f"{list(self.needle_start)}, thread curvature {self.thread_start_curvature:g}"
                 expectation = f"{name} in the dish, off the obstacles: it would be in {what}"
                 raise ConfigurationError(f"{self.GROUP}.needle_start", start, expectation)
 
     def thread_at_start(self, at: NDArray[np.float64]) -> Points:
         """Return points along the thread as it lies at the start, `at` from 0 to 1, shape (m, 2) [m]."""
-        x, y, heading = self.needle_start
-        tail = np.array([x, y])
-        return needle_axis(tail, heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]
+        *tail, heading = self.needle_start
+        return needle_axis(np.array(tail), heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]
 
     def view(self, scene: Scene) -> DishView:
         """Return where the dish is in the image: a little off the middle, as in a real rig."""
@@ -166,32 +198,13 @@ class RigSettings(
         return DishView((0.5 * self.camera_width + 2.0, 0.5 * self.camera_height - 2.0), scale)
 
     def camera(self, scene: Scene) -> DishCamera:
-        """Return the camera over the dish."""
-        seen = CameraScene(
-            dish_diameter=scene.dish.diameter,
-            needle_length=self.needle_length,
-            needle_width=self.needle_width,
-            needle_curvature=self.needle_curvature,
-            thread_diameter=self.thread_diameter,
-            obstacles=scene.obstacles,
-            looks=self._looks(scene),
-        )
+        """Return the camera over the dish; shapes look as `obstacle_looks` says of all of them, else by their kind."""
+        names = self.obstacle_looks if len(self.obstacle_looks) == len(scene.shapes) else ()
+        needle = self.needle_length, self.needle_width, self.needle_curvature
+        looks = tuple(LOOKS[name] for name in names or [LOOK_OF_KIND[shape.kind] for shape in scene.shapes])
+        seen = CameraScene(scene.dish.diameter, *needle, self.thread_diameter, obstacles=scene.obstacles, looks=looks)
         lighting = Lighting(gain=self.light_gain, noise=self.noise)
         return DishCamera(seen, self.view(scene), (self.camera_width, self.camera_height), self.seed, lighting)
-
-    def _looks(self, scene: Scene) -> tuple[Look, ...]:
-        """Return how each shape looks: as told, where that is told of all; else by its kind."""
-        told = self.obstacle_looks if len(self.obstacle_looks) == len(scene.shapes) else ()
-        return tuple(LOOKS[name] for name in told or [LOOK_OF_KIND[shape.kind] for shape in scene.shapes])
-
-    def schedule(self, scene: Scene) -> FaultSchedule:
-        """Return what goes wrong and when."""
-        faults = [Fault.parse(text) for text in self.faults]
-        return FaultSchedule(faults, scene.dish.diameter, self.needle_length, self.seed)
-
-    def field(self) -> CoilField:
-        """Return the coils' field."""
-        return CoilField(self.coil_angles, self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns)
 
     def power(self) -> StageProcess | None:
         """Return the simulated boards, None where currents come as messages."""
@@ -201,42 +214,25 @@ class RigSettings(
 
     def surface(self, scene: Scene) -> Surface:
         """Return the surfaces that needle and thread can touch; the hole of a shape is drawn but has no contact."""
-        return Surface(
-            discs=tuple(o for o in scene.obstacles if isinstance(o, Disc)),
-            polygons=tuple(o.rings[0] for o in scene.obstacles if isinstance(o, Polygon)),
-            wall_radius=scene.dish.radius,
-            friction=self.thread_friction,
-            self_contact=scene.dish.has_self_contact(self.thread_diameter),
-        )
+        discs = tuple(shape for shape in scene.obstacles if isinstance(shape, Disc))
+        polygons = tuple(shape for shape in scene.obstacles if isinstance(shape, Polygon))
+        touches = scene.dish.has_self_contact(self.thread_diameter)
+        return Surface(discs, polygons, scene.dish.radius, friction=self.thread_friction, self_contact=touches)
 
     def dynamics(self, scene: Scene) -> RigDynamics:
         """Return needle and thread at their start, in the field of the coils."""
         x, y, heading = self.needle_start
-        tail = np.array([x, y])
-        behind = self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1))
+        shape = self.needle_length, self.needle_width, self.needle_curvature
+        stiffness = self.thread_bending_stiffness, self.thread_stretching_stiffness
+        drag = self.thread_drag_across, self.thread_drag_along
+        joint, size = NeedleJoint(self.thread_attachment), (self.thread_length, self.thread_segments)
         return RigDynamics(
-            needle=NeedleBody(
-                length=self.needle_length,
-                diameter=self.needle_width,
-                curvature=self.needle_curvature,
-                magnetisation=self.needle_magnetisation,
-                viscosity=self.viscosity,
-            ),
-            thread=ThreadProperties(
-                length=self.thread_length,
-                segments=self.thread_segments,
-                bending_stiffness=self.thread_bending_stiffness,
-                stretching_stiffness=self.thread_stretching_stiffness,
-                drag_across=self.thread_drag_across,
-                drag_along=self.thread_drag_along,
-                attachment=NeedleJoint(self.thread_attachment),
-                diameter=self.thread_diameter,
-            ),
-            surface=self.surface(scene),
-            field=self.field(),
-            tail=tail,
-            heading=heading,
-            thread_points=behind,
-            # Twice the usual step costs half the time and is as exact to 0.01 % of the length.
-            largest_step=4e-3,
+            NeedleBody(*shape, self.needle_magnetisation, self.viscosity),
+            ThreadProperties(*size, *stiffness, *drag, joint, self.thread_diameter),
+            self.surface(scene),
+            CoilField(self.coil_angles, self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns),
+            (x, y),
+            heading,
+            self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1)),
+            largest_step=4e-3,  # s; twice the usual costs half the time and is as exact to 0.01 % of the length
         )

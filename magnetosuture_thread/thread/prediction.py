@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.arrays import as_numbers
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, as_numbers
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.forces import ThreadForces

@@ -10,12 +10,10 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.barrier import Barrier, check_barriers
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_checks import find_collision
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside, finite_array
+from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError

@@ -16,8 +16,7 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.thread.prediction import NeedlePose
 
 SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, max_step=0.07)  # one step a pose

@@ -8,13 +8,8 @@ import pytest
 from magnetosuture_thread.geometry.camera import DishView
 
 
-def test_axes_and_scale():
-    view = DishView((322.0, 238.0), 8e-5)
-    np.testing.assert_allclose(view.to_dish(np.array([322.0, 238.0])), [0.0, 0.0])
-    np.testing.assert_allclose(view.to_dish(np.array([332.0, 228.0])), [8e-4, 8e-4])
-
-
-def test_a_turned_dish_has_its_x_axis_counter_clockwise_as_seen():
+def test_x_is_to_the_right_and_of_a_turned_dish_counter_clockwise_as_seen():
+    np.testing.assert_allclose(DishView((322.0, 238.0), 8e-5).to_dish(np.array([332.0, 228.0])), [8e-4, 8e-4])
     view = DishView((320.0, 240.0), 1e-4, np.radians(90.0))
     np.testing.assert_allclose(view.to_pixels(np.array([1e-3, 0.0])), [320.0, 230.0], atol=1e-9)  # up in the image
     np.testing.assert_allclose(view.to_pixels(np.array([0.0, 1e-3])), [310.0, 240.0], atol=1e-9)

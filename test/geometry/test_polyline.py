@@ -10,12 +10,6 @@ from hypothesis import strategies as st
 from magnetosuture_thread.geometry.polyline import arc_lengths, chain_along, chain_inside, lay_behind_needle, points_at
 
 
-def test_arc_lengths_and_points_of_a_corner():
-    corner = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0]])
-    assert arc_lengths(corner).tolist() == [0.0, 2.0, 3.0]
-    assert points_at(corner, np.array([-1.0, 2.5, 9.0])).tolist() == [[0.0, 0.0], [2.0, 0.5], [2.0, 1.0]]
-
-
 @given(
     steps=st.lists(st.tuples(st.floats(0.05, 1.0), st.floats(-1.2, 1.2)), min_size=1, max_size=30),
     segments=st.integers(1, 40),

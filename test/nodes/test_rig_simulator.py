@@ -8,7 +8,7 @@ from std_msgs.msg import String
 
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
-from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
+from magnetosuture_thread.rig.dynamics import RigDynamics
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.settings.errors import SolverError
 from test.nodes import wire

@@ -11,8 +11,7 @@ from magnetosuture_msgs.msg import Disc, Outline, Polygon, SceneShape
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
 from magnetosuture_thread.bags.reading import parse_scene_message
-from magnetosuture_thread.geometry.scene_files import read_scene, write_scene
-from magnetosuture_thread.geometry.scene_shapes import shape_from_mapping
+from magnetosuture_thread.geometry.scene_files import read_scene, shape_from_mapping, write_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.settings.interface import Service

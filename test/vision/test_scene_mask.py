@@ -9,8 +9,7 @@ import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_files import read_scene
-from magnetosuture_thread.geometry.scene_shapes import scene_from_mapping
+from magnetosuture_thread.geometry.scene_files import read_scene, scene_from_mapping
 from magnetosuture_thread.rig import camera as drawn
 from magnetosuture_thread.rig.camera import DishCamera, Look
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

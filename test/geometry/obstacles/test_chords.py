@@ -24,15 +24,8 @@ def rounded(radius: float, corners: int) -> Polygon:
 
 def contacts(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
     """Return distance, place and normal of every contact of one segment, the nearest first."""
-    return contacts_of(obstacle, np.array([start, end]))
-
-
-def contacts_of(obstacle: Obstacle, points: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
-    """Return the same of a chain."""
-    room, dimension = 50, points.shape[1]
-    to = Contacts.room(room, dimension)
-    data = Workspace((obstacle,), REACH, dimension).data
-    clearance = np.full(len(points), -np.inf)
+    points, to = np.array([start, end]), Contacts.room(50, 2)
+    data, clearance = Workspace((obstacle,), REACH).data, np.full(2, -np.inf)
     assert find_chord_contacts(points, data, SEGMENT, 0.0, -clearance, 0, to) == 0
     found = find_chord_contacts(points, data, SEGMENT, 0.0, clearance, 0, to)
     assert found >= 0

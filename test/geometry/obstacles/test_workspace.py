@@ -10,13 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.geometry.obstacles import (
-    WALL,
-    Disc,
-    Obstacle,
-    Polygon,
-    Workspace,
-)
+from magnetosuture_thread.geometry.obstacles import WALL, Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
@@ -108,11 +102,8 @@ def test_a_needle_and_a_notch_keep_their_signs():
 
 
 def test_contacts_come_by_nodes_and_then_by_obstacles_whatever_their_kind():
-    shapes: list[Obstacle] = [
-        SQUARE,
-        Disc((0.015, 0.005), 0.002),
-        Polygon(((0.02, 0.0), (0.03, 0.0), (0.03, 0.01), (0.02, 0.01))),
-    ]
+    other = Polygon(tuple((x + 0.02, y) for x, y in SQUARE.outline))
+    shapes: list[Obstacle] = [SQUARE, Disc((0.015, 0.005), 0.002), other]
     points = np.array([[0.0125, 0.005], [np.nan, 0.005], [0.015, 0.005], [0.5, 0.5], [0.018, 0.005]])
     contacts = Workspace(shapes, 0.003).near(points)
     assert contacts.node.tolist() == [0, 0, 2, 4, 4]

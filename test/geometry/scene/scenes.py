@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import pytest
+
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.geometry.scene_shapes import scene_from_mapping
+from magnetosuture_thread.geometry.scene_files import scene_from_mapping
 
 SECTOR = {"center": [0.0, -0.005], "inner_radius": 0.0077, "outer_radius": 0.0111, "start_angle": 3.5, "end_angle": 6.0}
 SQUARE = [[-0.004, 0.008], [0.004, 0.008], [0.0041, 0.014], [-0.004, 0.014]]
@@ -21,6 +24,16 @@ SHAPES: dict[str, Any] = {
         "kind": "tissue",
     },
 }
+
+
+def check_refused(kind: type[Exception], read: Callable[[], Any], start: str, most: int = 500) -> None:
+    """Check that something is refused in one short line that begins with some words."""
+    with pytest.raises(kind) as caught:
+        read()
+    text = str(caught.value)
+    assert text.startswith(start)
+    assert "\n" not in text
+    assert len(text) < most
 
 
 def every_shape() -> Scene:

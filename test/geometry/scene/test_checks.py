@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.geometry.scene_checks import scene_warnings
-from magnetosuture_thread.geometry.scene_files import read_scene
-from magnetosuture_thread.geometry.scene_shapes import shape_from_mapping
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape, SceneWarning, scene_warnings
+from magnetosuture_thread.geometry.scene_files import read_scene, shape_from_mapping
 
 WIDTH = 0.0004
 SQUARE = ((0.0, 0.0), (0.004, 0.0), (0.004, 0.004), (0.0, 0.004))
@@ -62,9 +60,11 @@ def test_check_reports_a_shape_near_or_across_the_wall():
 
 
 def test_check_reports_a_hole_too_narrow_for_the_needle():
-    wide = shape_from_mapping("wide", {"annulus": {"center": [0, 0], "inner_radius": 0.00021, "outer_radius": 0.002}})
-    assert scene_warnings(Scene(Dish(), (wide,)), WIDTH) == []
-    ring = shape_from_mapping("ring", {"annulus": {"center": [0, 0], "inner_radius": 0.00019, "outer_radius": 0.002}})
-    (warning,) = scene_warnings(Scene(Dish(), (ring,)), WIDTH)
+    def warnings(radius: float) -> list[SceneWarning]:
+        ring = {"annulus": {"center": [0, 0], "inner_radius": radius, "outer_radius": 0.002}}
+        return scene_warnings(Scene(Dish(), (shape_from_mapping("ring", ring),)), WIDTH)
+
+    assert warnings(0.00021) == []
+    (warning,) = warnings(0.00019)
     assert (warning.what, warning.shapes) == ("hole", ("ring",))
     assert warning.value == pytest.approx(0.00038, rel=0.02)

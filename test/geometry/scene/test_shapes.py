@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ import shapely
 from scipy.integrate import quad
 
 from magnetosuture_thread.geometry.obstacles import Polygon
-from magnetosuture_thread.geometry.scene_shapes import ARC_TOLERANCE, shape_from_mapping
+from magnetosuture_thread.geometry.scene_files import ARC_TOLERANCE, shape_from_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
+from test.geometry.scene.scenes import check_refused
 
 HALF_PI = 0.5 * math.pi
 
@@ -24,20 +26,11 @@ def polygon(**description: Any) -> Polygon:
     return geometry
 
 
-def solid(shape: Polygon) -> shapely.Polygon:
-    """Return a polygon as shapely has it."""
-    return shapely.Polygon(shape.outline, shape.holes)
-
-
-def bounds(shape: Polygon) -> list[float]:
-    """Return least x and y, greatest x and y [m]."""
-    return list(solid(shape).bounds)
-
-
 @pytest.mark.parametrize(("inner", "outer"), [(0.0045, 0.006), (0.0001, 0.0002), (0.02, 0.05)])
 def test_an_annulus_is_within_a_tolerance_of_its_circles(inner: float, outer: float):
     shape = polygon(annulus={"center": [0.001, 0.005], "inner_radius": inner, "outer_radius": outer})
-    assert bounds(shape) == pytest.approx([0.001 - outer, 0.005 - outer, 0.001 + outer, 0.005 + outer], abs=1e-12)
+    reach = (0.001 - outer, 0.005 - outer, 0.001 + outer, 0.005 + outer)
+    assert shape.solid.bounds == pytest.approx(reach, abs=1e-12)
     exact = math.pi * (outer**2 - inner**2)
     assert abs(shape.area - exact) <= ARC_TOLERANCE * 2.0 * math.pi * (inner + outer)
     for ring, radius in zip(shape.rings, (outer, inner), strict=True):
@@ -56,7 +49,7 @@ def sector_area(inner: float, outer: float, turn: float, inset: float) -> float:
 def test_an_annular_sector_leaves_a_strip_free(inset: float):
     fields = {"center": [0.0, 0.005], "inner_radius": 0.0077, "outer_radius": 0.0111, "inset": inset}
     shape = polygon(annular_sector={**fields, "start_angle": -HALF_PI, "end_angle": HALF_PI})
-    low, bottom, right, top = bounds(shape)
+    low, bottom, right, top = shape.solid.bounds
     straight = math.sqrt(0.0111**2 - inset**2)
     assert (low, right) == pytest.approx((inset, 0.0111), abs=ARC_TOLERANCE)
     assert (bottom, top) == pytest.approx((0.005 - straight, 0.005 + straight), abs=1e-11)
@@ -70,7 +63,7 @@ def test_a_corner_radius_takes_the_four_corners_off_a_sector():
     sharp, soft = polygon(annular_sector=fields), polygon(annular_sector=fields, corner_radius=0.001)
     lost = sharp.area - soft.area
     assert lost == pytest.approx(4.0 * (1.0 - 0.25 * math.pi) * 1e-6, rel=0.06)
-    assert solid(sharp).buffer(0.2 * ARC_TOLERANCE).contains(solid(soft))
+    assert sharp.solid.buffer(0.2 * ARC_TOLERANCE).contains(soft.solid)
     assert soft.can_contain(0.001)
 
 
@@ -100,14 +93,12 @@ def test_a_capsule_reaches_a_radius_around_its_segment(angle: float):
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -1.2])
 def test_a_rectangle_is_turned_about_its_centre(angle: float):
-    shape = polygon(rectangle={"center": [0.001, 0.002], "width": 0.004, "height": 0.002, "angle": angle})
+    plate = {"center": [0.001, 0.002], "width": 0.004, "height": 0.002, "angle": angle}
+    shape, soft = polygon(rectangle=plate), polygon(rectangle=plate, corner_radius=0.0005)
     assert shape.area == pytest.approx(8e-6, rel=1e-9)
     c, s = abs(math.cos(angle)), abs(math.sin(angle))
-    half = 0.5 * np.array([0.004 * c + 0.002 * s, 0.004 * s + 0.002 * c])
-    assert bounds(shape) == pytest.approx([0.001 - half[0], 0.002 - half[1], 0.001 + half[0], 0.002 + half[1]])
-    soft = polygon(
-        rectangle={"center": [0.001, 0.002], "width": 0.004, "height": 0.002, "angle": angle}, corner_radius=0.0005
-    )
+    x, y = 0.5 * np.array([0.004 * c + 0.002 * s, 0.004 * s + 0.002 * c])
+    assert shape.solid.bounds == pytest.approx((0.001 - x, 0.002 - y, 0.001 + x, 0.002 + y))
     exact = 8e-6 - (4.0 - math.pi) * 0.0005**2
     assert soft.area == pytest.approx(exact, abs=ARC_TOLERANCE * 2.0 * math.pi * 0.0005)
 
@@ -134,9 +125,5 @@ BAD: list[tuple[Any, str]] = [
 
 @pytest.mark.parametrize(("description", "words"), BAD, ids=lambda value: value if isinstance(value, str) else "")
 def test_a_bad_shape_is_refused_in_one_line_that_names_file_shape_and_field(description: Any, words: str):
-    with pytest.raises(ConfigurationError) as caught:
-        shape_from_mapping("post", description, "lab.yaml")
-    text = str(caught.value)
-    assert text.startswith(f"lab.yaml: {words}")
-    assert "\n" not in text
-    assert len(text) < 500
+    read = partial(shape_from_mapping, "post", description, "lab.yaml")
+    check_refused(ConfigurationError, read, f"lab.yaml: {words}")

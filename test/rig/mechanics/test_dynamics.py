@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread import Polygon
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 
 Vector = NDArray[np.float64]
 NEEDLE = NeedleBody(7e-3, 4e-4, 0.0, 1e6, 1.0)
@@ -107,7 +107,7 @@ def test_the_wall_stops_the_needle(heading: float):
 def test_the_thread_goes_round_an_obstacle():
     square = 2e-3 * SQUARE
     start = np.array([[-1e-3, 2.5e-3], [-20e-3, 2.5e-3]])
-    made = rig(surface=Surface(polygons=(square,)), points=start)
+    made = rig(surface=Surface(polygons=(Polygon(tuple(map(tuple, square))),)), points=start)
     # Once around and off to the left below, so that the thread is pulled over two corners.
     path = 3.2e-3 * np.array([[-0.3, 0.8], [1.2, 1.0], [1.2, -1.2], [-4.0, -1.2]])
     path[0] = start[0]

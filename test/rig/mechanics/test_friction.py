@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 
 RATE, SPEED, DRAG = 60.0, 1e-3, 0.5
 
@@ -25,16 +24,8 @@ def test_the_rigs_thread_around_a_post_has_the_tensions_of_a_capstan(friction: f
     tail = np.clip(at - lead - math.pi * radius, 0.0, None)
     x = radius * np.cos(turned) - tail * np.sin(turned) + np.clip(lead - at, 0.0, None)
     nodes = np.column_stack([x, radius * np.sin(turned) + tail * np.cos(turned)])
-    thread = ThreadProperties(
-        length=segments * segment,
-        segments=segments,
-        bending_stiffness=1e-14,
-        stretching_stiffness=5.65,
-        drag_across=2.0 * DRAG,
-        drag_along=DRAG,
-        attachment=NeedleJoint.PINNED,
-        diameter=60e-6,
-    )
+    drag = 2.0 * DRAG, DRAG
+    thread = ThreadProperties(segments * segment, segments, 1e-14, 5.65, *drag, NeedleJoint.PINNED, diameter=60e-6)
     surface = Surface((Disc((0.0, 0.0), 1e-3),), stiffness=5000.0, friction=friction)
     rig = RigDynamics(NeedleBody(2e-4, 5e-5, 0.0, 0.0, 1.0), thread, surface, None, nodes[0], 0.0, nodes)
     for k in range(1, 21):

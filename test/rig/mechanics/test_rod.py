@@ -8,12 +8,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
-from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle
-from magnetosuture_thread.rig.mechanics.rod import (
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.rig.contact import Shapes, Surface
+from magnetosuture_thread.rig.dynamics import Bodies, Needle, add_clamp, add_needle
+from magnetosuture_thread.rig.rod import (
     WIDTH,
     Rod,
+    StepTerms,
+    System,
     add_bending,
     add_contact,
     add_stretching,
@@ -81,11 +83,8 @@ def contact_term(shapes: Shapes) -> Term:
     return term
 
 
-def test_stretching_has_its_derivatives():
+def test_stretching_and_bending_have_their_derivatives():
     check_derivatives(lambda q, g, b, c: add_stretching(q, ROD, g, b, c), bent_state())
-
-
-def test_bending_has_its_derivatives():
     check_derivatives(lambda q, g, b, c: add_bending(q, ROD, g, b), bent_state(), 1e-7)
 
 
@@ -94,10 +93,10 @@ def test_the_needles_terms_have_their_derivatives():
     outline = np.column_stack([np.linspace(0.0, 7e-3, 9), np.zeros(9)])
     needle = Needle(resistance, np.array([7e-3, 1e-4]), 0.13, outline, 2e-4, 1.3)
     shapes = Surface((Disc((4e-3, 1.6e-3), 1.1e-3),), wall_radius=7.1e-3).packed()
-    q, field, rows = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]]), np.zeros((3, 6))
+    q, field, empty, rows = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]]), np.zeros(0), np.zeros((3, 6))
     rest = q - np.concatenate([[1e-2], np.full(len(q) - 1, 1e-5)])
-    turned = 500.0 * resistance
-    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, turned, rows, g, b, c), q)
+    bodies, terms = Bodies(needle, ROD, shapes), StepTerms(q, rest, rows, 500.0 * resistance, field, 0.0, rows)
+    check_derivatives(lambda q, g, b, c: add_needle(q, bodies, terms, System(g, b, empty, rows), c), q)
     check_derivatives(lambda q, g, b, c: add_clamp(q, needle, D, g, b, c), q, 1e-7)
 
 
@@ -115,4 +114,4 @@ def test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives():
     for depth in (4e-5, -1e-5):
         corner = middle - depth * away
         wedge = np.array([corner, corner + 2e-3 * away + 5e-4 * away[::-1], corner + 2e-3 * away - 5e-4 * away[::-1]])
-        check_derivatives(contact_term(Surface(polygons=(wedge,)).packed()), q)
+        check_derivatives(contact_term(Surface(polygons=(Polygon(tuple(map(tuple, wedge))),)).packed()), q)

@@ -11,8 +11,7 @@ import pytest
 from benchmarks.self_contact import move_rig
 from magnetosuture_thread import ConfigurationError, NeedlePose, Scene, ThreadPredictor
 from magnetosuture_thread.geometry.scene import Dish
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 

@@ -1,4 +1,4 @@
-"""What the needle and the thread can touch: discs, polygons and the wall of the dish.
+"""Contacts of the needle and the thread: with discs, polygons and the wall of the dish.
 
 A contact is a gap g, at least 0 where nothing touches, and an energy k / 2 g^2 below: frictionless, stiff, and
 with an exact second derivative, from the gap's gradient and curvature.
@@ -7,20 +7,20 @@ with an exact second derivative, from the gap's gradient and curvature.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 
 Vector = NDArray[np.float64]
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
-GRID = 128  # cells along the longer side of all that can be touched
 BLOCK = 8  # edges of a polygon that are passed over together where all of them are too far
 
 
@@ -30,6 +30,7 @@ class Shapes(NamedTuple):
     Attributes:
         discs: centre, radius, shape (k, 3) [m].
         corners: of all polygons, the solid to the left of every edge, shape (c, 2) [m].
+        normals: outward, of the edge that ends at each corner and of that which begins there, shape (c, 4).
         convex: 1 at corners that stick out of the solid, else 0, shape (c,).
         starts: where each polygon begins in `corners`, and the end, shape (p + 1,).
         boxes: least x, least y, greatest x, greatest y of each polygon, shape (p, 4) [m].
@@ -45,6 +46,7 @@ class Shapes(NamedTuple):
 
     discs: Vector
     corners: Vector
+    normals: Vector
     convex: Vector
     starts: NDArray[np.int64]
     boxes: Vector
@@ -60,12 +62,12 @@ class Shapes(NamedTuple):
 
 @dataclass(frozen=True)
 class Surface:
-    """What stands in the dish, and its wall.
+    """The surfaces of what stands in the dish, and its wall.
 
     Attributes:
         discs: round posts.
-        polygons: corners of simple polygons, solid inside, in either direction, each of shape (m, 2) [m].
-        wall_radius: inner radius of the dish around the origin, None without a wall [m].
+        polygons: solid inside of their outlines, holes too.
+        wall_radius: inner radius of the dish around the origin, inf without a wall [m].
         stiffness: k of a contact; a force f sinks in by f / k [N/m].
         skin: how far outside a contact begins, so that up to k times this nothing gets in at all [m]. A harder
             contact without it costs more: nodes that slide then leave and meet the surface at every step.
@@ -74,73 +76,62 @@ class Surface:
     """
 
     discs: tuple[Disc, ...] = ()
-    polygons: tuple[Vector, ...] = ()
-    wall_radius: float | None = None
+    polygons: tuple[Polygon, ...] = ()
+    wall_radius: float = math.inf
     stiffness: float = 500.0
     skin: float = 1.5e-6
     friction: float = 0.0
     self_contact: bool = False
 
     def packed(self) -> Shapes:
-        """Return the arrays that kernels read.
-
-        Raises:
-            ConfigurationError: a polygon bounds no area.
-        """
-        wall = math.inf if self.wall_radius is None else self.wall_radius
+        """Return the arrays that kernels read."""
         discs = np.array([(*disc.centre[:2], disc.radius) for disc in self.discs], dtype=np.float64).reshape(-1, 3)
-        rings = [_directed(ring) for ring in self.polygons]
-        boxes, blocks = _boxes(rings), [_boxes(_edge_blocks(ring)) for ring in rings]
-        reached = [*boxes, *((x - r, y - r, x + r, y + r) for x, y, r in [*discs, (0.0, 0.0, wall)] if r < math.inf)]
-        grid, cells = np.array([0.0, 0.0, 1.0]), np.full((1, 1), np.inf)
-        if reached:
-            low, high = np.min(reached, axis=0)[:2], np.max(reached, axis=0)[2:]
-            grid = np.array([*low, float(max(high - low)) / GRID])
-            cells = np.full(np.ceil((high - low)[::-1] / grid[2]).astype(int), np.inf)
-        shapes = Shapes(
-            discs=discs,
-            corners=np.concatenate([np.zeros((0, 2)), *rings]),
-            convex=np.concatenate([np.zeros(0), *(_convex(ring) for ring in rings)]),
-            starts=np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int64),
-            boxes=boxes,
-            blocks=np.concatenate([np.zeros((0, 4)), *blocks]),
-            block_starts=np.cumsum([0, *map(len, blocks)]).astype(np.int64),
-            grid=grid,
-            clearances=cells,
-            wall=float(wall),
-            stiffness=float(self.stiffness),
-            friction=float(self.friction),
-            self_contact=bool(self.self_contact),
+        rings = [polygon.rings[0] for polygon in self.polygons]
+        boxes, normals = _boxes(rings), [_normals(ring) for ring in rings]
+        ends = [np.concatenate([ring[-1:], ring]) for ring in rings]  # edge i ends at corner i
+        blocks = [_boxes(end[k : k + BLOCK + 1] for k in range(0, len(end) - 1, BLOCK)) for end in ends]
+        return Shapes(
+            discs,
+            np.concatenate([np.zeros((0, 2)), *rings]),
+            np.concatenate([np.zeros((0, 4)), *normals]),
+            np.concatenate([np.zeros(0), *(n[:, 0] * n[:, 3] - n[:, 1] * n[:, 2] > 0.0 for n in normals)]),
+            np.cumsum([0, *map(len, rings)], dtype=np.int64),
+            boxes,
+            np.concatenate([np.zeros((0, 4)), *blocks]),
+            np.cumsum([0, *map(len, blocks)], dtype=np.int64),
+            *_clearances(discs, rings, boxes, self.wall_radius),
+            float(self.wall_radius),
+            float(self.stiffness),
+            float(self.friction),
+            bool(self.self_contact),
         )
-        _find_clearances(shapes)
-        return shapes
 
 
-def _directed(given: Vector) -> Vector:
-    """Return a ring counter-clockwise and open."""
-    ring = np.array(given, dtype=np.float64)
-    ring = ring[:-1] if (ring[0] == ring[-1]).all() else ring
-    x, y = (ring - ring[:1]).T
-    area = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
-    if not abs(area) > 0.0:
-        raise ConfigurationError("surface.polygons", ring.tolist(), "at least three distinct corners around an area")
-    return ring if area > 0.0 else np.ascontiguousarray(ring[::-1])
-
-
-def _convex(ring: Vector) -> Vector:
-    before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
-    return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
-
-
-def _boxes(parts: list[Vector]) -> Vector:
+def _boxes(parts: Iterable[Vector]) -> Vector:
     """Return least x and y, greatest x and y of sets of points, shape (k, 4)."""
     return np.array([(*part.min(axis=0), *part.max(axis=0)) for part in parts], dtype=np.float64).reshape(-1, 4)
 
 
-def _edge_blocks(ring: Vector) -> list[Vector]:
-    """Return the corners of each `BLOCK` edges of a ring; edge i ends at corner i."""
-    ends = np.concatenate([ring[-1:], ring])
-    return [ends[first : first + BLOCK + 1] for first in range(0, len(ring), BLOCK)]
+def _normals(ring: Vector) -> Vector:
+    """Return the outward normals of the two edges at each corner, shape (c, 4)."""
+    along = ring - np.roll(ring, 1, axis=0)
+    normal = np.column_stack([along[:, 1], -along[:, 0]]) / np.sqrt(np.sum(along**2, axis=1))[:, None]
+    return np.hstack([normal, np.roll(normal, -1, axis=0)])
+
+
+def _clearances(discs: Vector, rings: list[Vector], boxes: Vector, wall: float) -> tuple[Vector, Vector]:
+    """Return grid and clearances of `Shapes`: 128 cells along the longer side of all that can be touched."""
+    round_ones = [row for row in (*discs, (0.0, 0.0, wall)) if row[2] < np.inf]
+    reached = np.array([*boxes, *((x - r, y - r, x + r, y + r) for x, y, r in round_ones)])
+    if not len(reached):
+        return np.array([0.0, 0.0, 1.0]), np.full((1, 1), np.inf)
+    low, high = reached[:, :2].min(axis=0), reached[:, 2:].max(axis=0)
+    side = float(max(high - low)) / 128
+    columns, rows = np.ceil((high - low) / side).astype(int)
+    x, y = np.meshgrid(low[0] + side * (np.arange(columns) + 0.5), low[1] + side * (np.arange(rows) + 0.5))
+    gaps = [wall - np.hypot(x, y), *(np.hypot(x - disc[0], y - disc[1]) - disc[2] for disc in discs)]
+    gaps += [shapely.distance(shapely.points(x, y), shapely.Polygon(ring)) for ring in rings]
+    return np.array([*low, side]), np.min(gaps, axis=0) - 0.75 * side  # half a diagonal and more
 
 
 @compiled_inline
@@ -154,6 +145,16 @@ def clear(x: float, y: float, reach: float, shapes: Shapes) -> bool:
     i = int(min(max((y - grid[1]) / grid[2], 0.0), rows - 1.0))
     j = int(min(max((x - grid[0]) / grid[2], 0.0), columns - 1.0))
     return bool(clearances[i, j] > reach)
+
+
+@compiled_inline
+def write_row(rows: Vector, count: int, a: int, s: float, depth: float, nx: float, ny: float, last: float) -> int:
+    """Write a row of six numbers, where there is room; return the new count."""
+    if count >= rows.shape[0]:
+        return count
+    rows[count, 0], rows[count, 1], rows[count, 2] = a, s, depth
+    rows[count, 3], rows[count, 4], rows[count, 5] = nx, ny, last
+    return count + 1
 
 
 @compiled_inline
@@ -193,88 +194,58 @@ def polygon_gap(x: float, y: float, shapes: Shapes, p: int) -> tuple[float, floa
             if distance < least:
                 least, nearest, last, place, inner = distance, i, j, t, s
             j = i
+    distance, nx, ny = math.sqrt(least), shapes.normals[nearest, 0], shapes.normals[nearest, 1]
+    if distance < 1e-12:
+        return 0.0, nx, ny, 0.0, last, nearest
     ex, ey = corners[nearest, 0] - corners[last, 0], corners[nearest, 1] - corners[last, 1]
     dx, dy = x - corners[last, 0], y - corners[last, 1]
-    distance = math.sqrt(least)
-    if distance < 1e-12:
-        size = math.sqrt(ex * ex + ey * ey)
-        return 0.0, ey / size, -ex / size, 0.0, last, nearest
     # Beside an edge its side tells; off its ends whether the corner sticks out of the solid.
     beside = place == inner
-    within = ex * dy - ey * dx > 0.0 if beside else shapes.convex[last if place == 0.0 else nearest] == 0.0
+    within = nx * dx + ny * dy < 0.0 if beside else shapes.convex[last if place == 0.0 else nearest] == 0.0
     gap = -distance if within else distance
     return gap, (dx - place * ex) / gap, (dy - place * ey) / gap, 0.0 if beside else 1.0 / gap, last, nearest
 
 
-@compiled
-def _find_clearances(shapes: Shapes) -> None:
-    # Clearances are not found beyond 8 cells.
-    most, side = 8.0 * shapes.grid[2], shapes.grid[2]
-    for i in range(shapes.clearances.shape[0]):
-        for j in range(shapes.clearances.shape[1]):
-            x, y = shapes.grid[0] + (j + 0.5) * side, shapes.grid[1] + (i + 0.5) * side
-            gap = min(most, shapes.wall - math.sqrt(x * x + y * y))
-            for disc in shapes.discs:
-                gap = min(gap, math.sqrt((x - disc[0]) ** 2 + (y - disc[1]) ** 2) - disc[2])
-            for p in range(shapes.boxes.shape[0]):
-                box = shapes.boxes[p]
-                if box[0] - gap < x < box[2] + gap and box[1] - gap < y < box[3] + gap:
-                    gap = min(gap, polygon_gap(x, y, shapes, p)[0])
-            shapes.clearances[i, j] = gap - 0.75 * side  # half a diagonal and more
-
-
 @compiled_uncounted
-def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: Vector) -> int:
-    """Write what a round point sinks into; return how many.
+def point_contacts(a: int, x: float, y: float, radius: float, shapes: Shapes, rows: Vector, count: int) -> int:
+    """Write what a round point sinks into; return the new count.
 
     In a corner that opens away from the solid both edges hold it. By the nearer one alone the least energy would be at
     a kink, where no force is balanced and Newton's iteration goes from one side to the other without end.
 
     Args:
+        a: index of its first unknown.
         x: of its centre [m].
         y: the same.
         radius: of the point [m].
         shapes: the surface.
-        rows: gets depth, gradient n_x, n_y of the gap and its curvature c, where the gap's second derivative
-            is c (I - n n'), shape (k, 6); the first two columns are left to the caller. What finds no row is left out.
+        rows: gets a, -1, depth, gradient n_x, n_y of the gap and its curvature c, where the gap's second derivative
+            is c (I - n n'), shape (k, 6). What finds no row is left out.
+        count: of the rows that are in use.
     """
-    count, most = 0, rows.shape[0]
     for i in range(shapes.discs.shape[0]):
         dx, dy = x - shapes.discs[i, 0], y - shapes.discs[i, 1]
-        reach = shapes.discs[i, 2] + radius
-        square = dx * dx + dy * dy
-        if 0.0 < square < reach * reach and count < most:
+        reach, square = shapes.discs[i, 2] + radius, dx * dx + dy * dy
+        if 0.0 < square < reach * reach:
             size = math.sqrt(square)
-            rows[count, 2], rows[count, 3], rows[count, 4] = reach - size, dx / size, dy / size
-            rows[count, 5] = 1.0 / size
-            count += 1
-    square = x * x + y * y
-    reach = shapes.wall - radius
-    if square > reach * reach and count < most:
+            count = write_row(rows, count, a, -1.0, reach - size, dx / size, dy / size, 1.0 / size)
+    reach, square = shapes.wall - radius, x * x + y * y
+    if square > reach * reach:
         size = math.sqrt(square)
-        rows[count, 2], rows[count, 3], rows[count, 4] = size - reach, -x / size, -y / size
-        rows[count, 5] = -1.0 / size
-        count += 1
+        count = write_row(rows, count, a, -1.0, size - reach, -x / size, -y / size, -1.0 / size)
     for p in range(shapes.boxes.shape[0]):
-        box = shapes.boxes[p]
-        if box[0] - radius < x < box[2] + radius and box[1] - radius < y < box[3] + radius and count < most:
-            gap, nx, ny, bend, last, nearest = polygon_gap(x, y, shapes, p)
-            if gap >= radius:
-                continue
-            rows[count, 2], rows[count, 3], rows[count, 4], rows[count, 5] = radius - gap, nx, ny, bend
-            count += 1
-            start, end, corners = shapes.starts[p], shapes.starts[p + 1], shapes.corners
-            before, after = last - 1 if last > start else end - 1, nearest + 1 if nearest + 1 < end else start
-            for corner, a, b in ((last, before, last), (nearest, nearest, after)):
-                if shapes.convex[corner] == 1.0 or count >= most:
-                    continue
-                ex, ey = corners[b, 0] - corners[a, 0], corners[b, 1] - corners[a, 1]
-                size = math.sqrt(ex * ex + ey * ey)
-                nx, ny = ey / size, -ex / size
-                gap = nx * (x - corners[corner, 0]) + ny * (y - corners[corner, 1])
-                if gap < radius:
-                    rows[count, 2], rows[count, 3], rows[count, 4], rows[count, 5] = radius - gap, nx, ny, 0.0
-                    count += 1
+        if _box_square(x, y, shapes.boxes[p]) >= radius * radius:
+            continue
+        gap, nx, ny, bend, last, nearest = polygon_gap(x, y, shapes, p)
+        if gap >= radius:
+            continue
+        count = write_row(rows, count, a, -1.0, radius - gap, nx, ny, bend)
+        for k in range(2):  # the edge before, and the one behind
+            corner, edge = (last, 0) if k == 0 else (nearest, 2)
+            nx, ny = shapes.normals[corner, edge], shapes.normals[corner, edge + 1]
+            gap = nx * (x - shapes.corners[corner, 0]) + ny * (y - shapes.corners[corner, 1])
+            if shapes.convex[corner] == 0.0 and gap < radius:
+                count = write_row(rows, count, a, -1.0, radius - gap, nx, ny, 0.0)
     return count
 
 
@@ -294,8 +265,8 @@ def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: floa
 
 
 @compiled_uncounted
-def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Shapes, rows: Vector) -> int:
-    """Write what a segment sinks into: discs with its inner part, and corners that stick out; return how many.
+def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Shapes, rows: Vector, count: int) -> int:
+    """Write what a segment sinks into: discs with its inner part, and corners that stick out; return the new count.
 
     Against a disc of reach r, a chain of chords D that all touch the circle of radius (D / 2) / tan(D / 2 r) from
     outside turns as a thread of the same length on the disc does. That is the radius a segment keeps, less than
@@ -311,53 +282,46 @@ def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Sh
         shapes: the surface.
         rows: gets index a, place s from the first node, depth, gradient n_x, n_y there, and the gap, shape (k, 6); or,
             of a corner beyond an end, what `point_contacts` has for the node. What finds no row is left out.
+        count: of the rows that are in use.
     """
-    count, most = 0, rows.shape[0]
     ax, ay, bx, by = q[a], q[a + 1], q[a + 2], q[a + 3]
-    size = math.sqrt((bx - ax) ** 2 + (by - ay) ** 2)
-    mx, my = 0.5 * (ax + bx), 0.5 * (ay + by)
+    ex, ey = bx - ax, by - ay
+    square = ex * ex + ey * ey
+    size, mx, my = math.sqrt(square), 0.5 * (ax + bx), 0.5 * (ay + by)
     for i in range(shapes.discs.shape[0]):
-        reach = shapes.discs[i, 2] + radius
-        if (mx - shapes.discs[i, 0]) ** 2 + (my - shapes.discs[i, 1]) ** 2 > (reach + 0.5 * size) ** 2:
+        x, y, reach = shapes.discs[i, 0], shapes.discs[i, 1], shapes.discs[i, 2] + radius
+        if (mx - x) ** 2 + (my - y) ** 2 > (reach + 0.5 * size) ** 2:
             continue
         half = 0.5 * length / reach
         reach *= max(half / math.tan(half), MIN_APOTHEM) if half < 1.5 else MIN_APOTHEM
-        gap, nx, ny, s = _segment_gap(ax, ay, bx, by, shapes.discs[i, 0], shapes.discs[i, 1])
-        if 0.0 < s < 1.0 and gap < reach and count < most:
-            rows[count, 0], rows[count, 1], rows[count, 2] = a, s, reach - gap
-            rows[count, 3], rows[count, 4], rows[count, 5] = nx, ny, gap
-            count += 1
+        gap, nx, ny, s = _segment_gap(ax, ay, bx, by, x, y)
+        if 0.0 < s < 1.0 and gap < reach:
+            count = write_row(rows, count, a, s, reach - gap, nx, ny, gap)
     # A chord this deep behind a corner passes beside it, not over it.
     deepest = max(radius, 0.25 * size)
-    ex, ey, square, corners = bx - ax, by - ay, size * size, shapes.corners
+    reach = 0.5 * size + deepest
     for p in range(shapes.boxes.shape[0]):
-        reach, first = 0.5 * size + deepest, shapes.block_starts[p]
         if _box_square(mx, my, shapes.boxes[p]) >= reach * reach:
             continue
-        for k in range(first, shapes.block_starts[p + 1]):
+        for k in range(shapes.block_starts[p], shapes.block_starts[p + 1]):
             if _box_square(mx, my, shapes.blocks[k]) >= reach * reach:
                 continue
-            begin = shapes.starts[p] + BLOCK * (k - first)
+            begin = shapes.starts[p] + BLOCK * (k - shapes.block_starts[p])
             for i in range(begin, min(begin + BLOCK, shapes.starts[p + 1])):
-                dx, dy = corners[i, 0] - ax, corners[i, 1] - ay
+                x, y = shapes.corners[i, 0], shapes.corners[i, 1]
                 # Most corners are beside the segment or far from its line, which takes no division to see.
-                along, margin = dx * ex + dy * ey, radius * size
-                if not -margin < along < square + margin or abs(dx * ey - dy * ex) >= deepest * size:
+                along, aside = (x - ax) * ex + (y - ay) * ey, (x - ax) * ey - (y - ay) * ex
+                margin = radius * size
+                if not -margin < along < square + margin or abs(aside) >= deepest * size or shapes.convex[i] == 0.0:
                     continue
-                if shapes.convex[i] == 0.0 or count >= most:
-                    continue
-                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
-                # Inside where it is to the left of both edges of the corner.
-                last = i - 1 if i > shapes.starts[p] else shapes.starts[p + 1] - 1
-                after = i + 1 if i + 1 < shapes.starts[p + 1] else shapes.starts[p]
-                ux, uy = corners[i, 0] - corners[last, 0], corners[i, 1] - corners[last, 1]
-                vx, vy = corners[after, 0] - corners[i, 0], corners[after, 1] - corners[i, 1]
-                if ux * ny - uy * nx > 0.0 and vx * ny - vy * nx > 0.0:
+                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, x, y)
+                normal = shapes.normals[i]  # inside where it is on the inner side of both edges of the corner
+                if nx * normal[0] + ny * normal[1] < 0.0 and nx * normal[2] + ny * normal[3] < 0.0:
                     gap, nx, ny = -gap, -nx, -ny
-                if gap < radius:
-                    rows[count, 0], rows[count, 1], rows[count, 2] = a, s, radius - gap
-                    rows[count, 3], rows[count, 4], rows[count, 5] = nx, ny, gap
-                    if s == 0.0 or s == 1.0:
-                        rows[count, 0], rows[count, 1], rows[count, 5] = a + 2.0 * s, -1.0, 1.0 / gap
-                    count += 1
+                if gap >= radius:
+                    continue
+                if 0.0 < s < 1.0:
+                    count = write_row(rows, count, a, s, radius - gap, nx, ny, gap)
+                else:
+                    count = write_row(rows, count, a if s == 0.0 else a + 2, -1.0, radius - gap, nx, ny, 1.0 / gap)
     return count

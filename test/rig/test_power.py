@@ -1,8 +1,9 @@
-"""Simulated boards in a process of their own."""
+"""Simulated boards behind pseudo-terminals, and in a process of their own."""
 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -12,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, StageProcess, checksum
+from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, Line, RoboClawBoard, StageProcess, checksum
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
-HALF_AND_BACK = bytes(
-    (129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00)
-)  # of the supply: a half, and a quarter reversed
+# Of the supply: a half, and a quarter reversed.
+HALF_AND_BACK = bytes((129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))
 RIG = """
 import sys, time
 from magnetosuture_thread.rig.power import StageProcess
@@ -87,3 +87,31 @@ def test_boards_go_with_a_rig_that_is_killed(tmp_path):
         rig.kill()
         rig.communicate()
     wait(lambda: not list(tmp_path.iterdir()), "the boards to be taken away")
+
+
+def main_voltage(path: Path) -> float:
+    """Return what the board at a path answers, once it has answered whole or 10 s are over [V]."""
+    device = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(device, question := bytes((128, Command.GET_MAIN_VOLTAGE)))
+        answer, until = b"", time.monotonic() + 10.0
+        while len(answer) < 4 and (left := until - time.monotonic()) > 0.0:
+            if select.select([device], [], [], left)[0]:
+                answer += os.read(device, 100)
+    finally:
+        os.close(device)
+    assert answer[2:] == checksum(question + answer[:2]).to_bytes(2, "big")
+    return 0.1 * int.from_bytes(answer[:2], "big")
+
+
+def test_what_a_killed_simulation_left_is_replaced_and_anything_else_stays(tmp_path):
+    (tmp_path / "left").symlink_to("/dev/pts/999999")
+    line = Line(tmp_path / "left", [RoboClawBoard()])
+    line.plug()
+    for _ in range(3):  # nobody has it open in between
+        assert main_voltage(line.path) == 24.0
+    line.unplug()
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(ConfigurationError, match="a path for a symbolic link"):
+        Line(tmp_path / "file", [RoboClawBoard()]).plug()
+    assert (tmp_path / "file").read_text() == "mine"

@@ -1,36 +1,40 @@
 """The dish in motion: a magnetic needle that coil currents pull through glycerin, and the thread behind it.
 
 Everything is overdamped. Needle and thread move in one implicit step: the thread's drag is greater than the
-needle's, so steps in turn would not be stable.
+needle's, so steps in turn would not be stable. Nothing here comes from the thread model.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from magnetosuture_thread.coils.field import fields_per_current
 from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, Vector
-from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, add_clamp, add_needle
-from magnetosuture_thread.rig.mechanics.rod import (
-    SLIP_SPEED,
+from magnetosuture_thread.rig.contact import Shapes, Surface, Vector, clear, point_contacts
+from magnetosuture_thread.rig.rod import (
     WIDTH,
     NeedleJoint,
     Rod,
+    StepTerms,
+    System,
     ThreadProperties,
     add_bending,
     add_contact,
     add_drag,
-    add_friction,
-    add_pairs,
+    add_rows,
     add_stretching,
     back_substitute,
     couple,
-    crosses_anew,
+    crossings,
     drag_matrices,
     factor,
     find_contacts,
@@ -41,15 +45,143 @@ from magnetosuture_thread.settings.errors import SolverError
 
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
+MU_0 = 4e-7 * math.pi  # T m/A
+SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
+STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
 MAX_HALVINGS = 8
 MIN_PART = 1e-6  # of Newton's move, below which the line search ends
 MAX_ITERATIONS = 60  # of Newton in a step
 CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
-ROUNDING, MIN_ENERGY = 1e-10, 1e-18  # of the energy, a sum of larger terms; and J, of a move by the tolerance
 # Typed: a kernel is compiled again for each one that is written out.
 EXACT, CONVEX = cast(bool, np.bool_(False)), cast(bool, np.bool_(True))
-STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
+
+
+class CoilField:
+    """The flux density of coils of one uniform layer around the dish, in its plane.
+
+    A coil is a sheet of current, integrated by Gauss and Legendre: loops at the nodes, and turns by the weights. With
+    six of them the field is right to 1e-6 from half a radius off a coil as long as its radius.
+
+    Args:
+        angles: direction of each coil from the dish's centre, and of its field for a positive current [rad].
+        distance: from the dish's centre to the middle of a coil [m].
+        radius: mean radius of the winding [m].
+        length: of the winding along its axis, 0 for a flat coil [m].
+        turns: their number.
+        loops: along the length of a coil.
+    """
+
+    def __init__(
+        self, angles: Sequence[float], distance: float, radius: float, length: float, turns: float, loops: int = 6
+    ) -> None:
+        nodes, weights = np.polynomial.legendre.leggauss(loops if length > 0.0 else 1)
+        away = distance + 0.5 * length * nodes
+        field = 0.5 * weights * turns * MU_0 * radius**2 / (2.0 * (radius**2 + away**2) ** 1.5)
+        direction = np.repeat(np.asarray(angles, dtype=np.float64), len(nodes))
+        self._axes = np.array([np.cos(direction), np.sin(direction)])
+        self._numbers = np.tile(np.array([away, np.full(len(nodes), radius), field]), len(angles))
+        self._shape = 2, len(angles), len(nodes)
+
+    def per_current(self, point: Vector) -> Vector:
+        """Return the flux density at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
+        loops = fields_per_current(float(point[0]), float(point[1]), self._axes, self._numbers)
+        return np.asarray(loops.reshape(self._shape).sum(axis=2))
+
+
+@dataclass(frozen=True)
+class NeedleBody:
+    """A slender round needle, straight or an arc, magnetised along its body.
+
+    Its frame has the origin at the tail and the x axis along the heading, the tangent at the tail. The
+    thread is tied to the tail; the tip is the other end.
+
+    Attributes:
+        length: along the body [m].
+        diameter: [m].
+        curvature: 0 when straight, positive when it bends to the left on the way from tail to tip [1/m].
+        magnetisation: along the body, from tail to tip [A/m].
+        viscosity: of the liquid [Pa s].
+    """
+
+    length: float
+    diameter: float
+    curvature: float
+    magnetisation: float
+    viscosity: float
+
+    @property
+    def pole(self) -> float:
+        """The pole at the tip, q = M pi d^2 / 4; the one at the tail is -q [A m]."""
+        return self.magnetisation * math.pi * self.diameter**2 / 4.0
+
+    @cached_property
+    def tip(self) -> Vector:
+        """The tip in the needle's frame, shape (2,) [m]."""
+        return np.asarray(self.outline(2)[1])
+
+    def outline(self, count: int) -> Vector:
+        """Return equally spaced points of the body in its frame, tail first, shape (count, 2) [m]."""
+        return needle_axis(np.zeros(2), 0.0, self.length, self.curvature, np.linspace(0.0, 1.0, count))[0]
+
+    @cached_property
+    def drag(self) -> tuple[float, float, float]:
+        """Drag of the straight needle: along [N s/m], across [N s/m], and turning about the middle [N m s].
+
+            along  = 2 pi eta L / (ln p - 0.207 + 0.980 / p - 0.133 / p^2),    p = L / d
+            across = 4 pi eta L / (ln p + 0.839 + 0.185 / p + 0.233 / p^2)
+            turn   = pi eta L^3 / (3 (ln p - 0.662 + 0.917 / p - 0.050 / p^2))
+
+        Source: Tirado and Garcia de la Torre, J. Chem. Phys. 71 (1979) 2581 and 73 (1980) 1986, for
+        2 <= p <= 30. Deviation: none.
+        """
+        p = self.length / self.diameter
+        unit = math.pi * self.viscosity * self.length
+        along = 2.0 * unit / (math.log(p) - 0.207 + 0.980 / p - 0.133 / p**2)
+        across = 4.0 * unit / (math.log(p) + 0.839 + 0.185 / p + 0.233 / p**2)
+        turn = unit * self.length**2 / (3.0 * (math.log(p) - 0.662 + 0.917 / p - 0.050 / p**2))
+        return along, across, turn
+
+    @cached_property
+    def resistance(self) -> Vector:
+        """Resistance to (omega, v_x, v_y) of the tail in the needle's frame, shape (3, 3).
+
+            R = integral over s of J' (along / L t t' + across / L n n') J,    J = [-y, 1, 0; x, 0, 1]
+
+        Torque about the tail and force (f_x, f_y) that move the needle are R (omega, v_x, v_y) [N m s, N s, N s/m].
+        What the ends add to the turning, turn - across L^2 / 12, is a couple beside it, so that a straight needle has
+        exactly the values of `drag`.
+        """
+        along, across, turn = self.drag
+        nodes, weights = np.polynomial.legendre.leggauss(16)
+        points, tangent = needle_axis(np.zeros(2), 0.0, self.length, self.curvature, 0.5 * (nodes + 1.0))
+        local = (along - across) * tangent[:, :, None] * tangent[:, None, :] + across * np.eye(2)
+        jacobian = np.zeros((len(nodes), 2, 3))
+        jacobian[:, 0, 1] = jacobian[:, 1, 2] = 1.0
+        jacobian[:, 0, 0], jacobian[:, 1, 0] = -points[:, 1], points[:, 0]
+        total = np.einsum("s,sia,sij,sjb->ab", 0.5 * weights, jacobian, local, jacobian)
+        total[0, 0] += turn - across * self.length**2 / 12.0
+        return np.asarray(total)
+
+
+class Needle(NamedTuple):
+    """A needle as kernels read it.
+
+    Attributes:
+        resistance: to (omega, v_x, v_y) of the tail in the needle's frame, shape (3, 3).
+        tip: in the needle's frame, shape (2,) [m].
+        pole: at the tip [A m].
+        outline: points that touch, in the needle's frame, shape (m, 2) [m].
+        radius: of these [m].
+        clamp: stiffness d of a clamped thread's d |x_1 - x_0 + R (D, 0)|^2, 0 when pinned [N/m].
+    """
+
+    resistance: Vector
+    tip: Vector
+    pole: float
+    outline: Vector
+    radius: float
+    clamp: float
 
 
 class Bodies(NamedTuple):
@@ -60,44 +192,92 @@ class Bodies(NamedTuple):
     shapes: Shapes
 
 
+@compiled
+def add_needle(q: Vector, bodies: Bodies, terms: StepTerms, system: System, convex: bool) -> float:
+    """Add the needle's terms: drag, poles in the field of the step, contact of its outline.
+
+        E = q_m B_tail . x_tail - q_m B_tip . x_tip,    x_tip = x_0 + R(theta) tip
+
+    Args:
+        q: state, its first three are heading, x and y of the tail [rad, m].
+        bodies: needle, thread, and what they can touch.
+        terms: of the step.
+        system: added to.
+        convex: whether to leave out what makes second derivatives indefinite.
+    """
+    needle, shapes, rest, field, k = bodies.needle, bodies.shapes, terms.rest, terms.field, bodies.shapes.stiffness
+    gradient, band, rows, energy = system.gradient, system.band, system.contacts, 0.0
+    for i in range(3):
+        force = 0.0
+        for j in range(3):
+            force += terms.turned[i, j] * (q[j] - rest[j])
+            if j <= i:
+                band[i, i - j] += terms.turned[i, j]
+        energy += 0.5 * force * (q[i] - rest[i])
+        gradient[i] += force
+    c, s = math.cos(q[0]), math.sin(q[0])
+    tx, ty = c * needle.tip[0] - s * needle.tip[1], s * needle.tip[0] + c * needle.tip[1]
+    fx, fy = needle.pole * field[1, 0], needle.pole * field[1, 1]
+    lx, ly = fx - needle.pole * field[0, 0], fy - needle.pole * field[0, 1]
+    # From where the step began, so that the sum keeps its digits.
+    energy -= lx * (q[1] - rest[1]) + ly * (q[2] - rest[2]) + fx * tx + fy * ty
+    gradient[0] -= fy * tx - fx * ty
+    gradient[1] -= lx
+    gradient[2] -= ly
+    band[0, 0] += max(fx * tx + fy * ty, 0.0 if convex else -np.inf)
+    for i in range(needle.outline.shape[0]):
+        ox = c * needle.outline[i, 0] - s * needle.outline[i, 1]
+        oy = s * needle.outline[i, 0] + c * needle.outline[i, 1]
+        if clear(q[1] + ox, q[2] + oy, needle.radius, shapes):
+            continue
+        for row in range(point_contacts(0, q[1] + ox, q[2] + oy, needle.radius, shapes, rows, 0)):
+            depth, nx, ny = rows[row, 2], rows[row, 3], rows[row, 4]
+            bend, arm = -rows[row, 5] * depth, nx * ox + ny * oy
+            along, across = (ny * ox - nx * oy, nx, ny), (arm, -ny, nx)  # ways of the point by the three unknowns
+            if convex:
+                bend, arm = max(bend, 0.0), max(arm, 0.0)
+            energy += 0.5 * k * depth * depth
+            for r in range(3):
+                gradient[r] -= k * depth * along[r]
+                for j in range(r + 1):
+                    band[r, r - j] += k * (along[r] * along[j] + bend * across[r] * across[j])
+            band[0, 0] += k * depth * arm
+    return float(energy)
+
+
+@compiled
+def add_clamp(q: Vector, needle: Needle, segment: float, gradient: Vector, band: Vector, convex: bool) -> float:
+    """Add d |x_1 - x_0 + R (D, 0)|^2, the half cell of bending at a clamped tail.
+
+    With d = EI / D^3 that is EI D / 4 curvature^2, the curvature from a mirrored node before the tail: of second order
+    in D.
+    """
+    d = needle.clamp
+    if d == 0.0:
+        return 0.0
+    hx, hy = math.cos(q[0]) * segment, math.sin(q[0]) * segment
+    ux, uy = q[3] - q[1] + hx, q[4] - q[2] + hy
+    along = min(ux * hx + uy * hy, 0.0 if convex else np.inf)
+    gradient[0] += 2.0 * d * (uy * hx - ux * hy)
+    for i, force in ((1, 2.0 * d * ux), (2, 2.0 * d * uy)):
+        gradient[i] -= force
+        gradient[i + 2] += force
+    band[0, 0] += 2.0 * d * (hx * hx + hy * hy - along)
+    for i, sign in ((1, 1.0), (3, -1.0)):  # tail, and the node behind it
+        band[i, i] += sign * 2.0 * d * hy
+        band[i + 1, i + 1] -= sign * 2.0 * d * hx
+        band[i, 0] += 2.0 * d
+        band[i + 1, 0] += 2.0 * d
+    band[3, 2] -= 2.0 * d
+    band[4, 2] -= 2.0 * d
+    return float(d * (ux * ux + uy * uy))
+
+
 class Field(Protocol):
     """The flux density of coils."""
 
     def per_current(self, point: Vector) -> Vector:
         """Return that at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
-
-
-class StepTerms(NamedTuple):
-    """What one step adds to the elastic energy, N = 2n + 3 unknowns.
-
-    Attributes:
-        begin: state at the start of the step, from which slip is measured, shape (N,) [rad, m].
-        rest: state from which drag is counted, shape (N,).
-        drag: of the thread's nodes, see `drag_matrices`.
-        turned: resistance of the needle to (theta, x, y) in the dish's frame, shape (3, 3).
-        field: flux density at tail and tip, shape (2, 2) [T].
-        friction: see `find_friction`.
-        slip: that smooths it [m].
-        pairs: see `find_pairs`.
-    """
-
-    begin: Vector
-    rest: Vector
-    drag: Vector
-    turned: Vector
-    field: Vector
-    friction: Vector
-    slip: float
-    pairs: Vector
-
-
-class System(NamedTuple):
-    """Gradient, band of second derivatives, and second derivatives of the rows of self-contact; rows to work in."""
-
-    gradient: Vector
-    band: Vector
-    second: Vector
-    rows: Vector
 
 
 @compiled
@@ -106,18 +286,17 @@ def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System
 
     Where the needle is driven, its three unknowns are known: they get no force and no coupling.
     """
-    needle, rod, shapes = bodies.needle, bodies.rod, bodies.shapes
-    g, band, second, rows = system
+    rod, shapes = bodies.rod, bodies.shapes
+    g, band, rows = system.gradient, system.band, system.contacts
     g[:] = 0.0
     band[:, :] = 0.0
     energy = add_drag(q, terms.rest, terms.drag, g, band)
     energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band)
     energy += add_contact(q, shapes.stiffness, rows[: find_contacts(q, rod, shapes, rows)], g, band, convex)
-    energy += add_friction(q, terms.begin, terms.slip, terms.friction, g, band)
-    energy += add_clamp(q, needle, rod.segment, g, band, convex)
-    energy += add_pairs(q, terms.begin, terms.slip, 2.0 * rod.radius, shapes.stiffness, terms.pairs, second, g)
+    energy += add_rows(q, terms, rod, shapes.stiffness, system)
+    energy += add_clamp(q, bodies.needle, rod.segment, g, band, convex)
     if not driven:
-        return energy + add_needle(q, terms.field, needle, shapes, terms.rest, terms.turned, rows, g, band, convex)
+        return energy + add_needle(q, bodies, terms, system, convex)
     for i in range(3):
         g[i] = 0.0
         band[i, :] = 0.0
@@ -152,13 +331,8 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
         Iterations, or -1 if the last move is more than `TOLERANCE`, or `STALLED` times as much where the energy's
         rounding ends the search; the last move [m]; the largest force that is left, torque as one at the tip [N].
     """
-    size, nodes = trial.shape[0], (trial.shape[0] - 1) // 2
-    system = System(
-        np.empty(size),
-        np.empty((size, WIDTH)),
-        np.zeros(terms.pairs.shape[0]),
-        np.empty((CONTACTS_PER_NODE * nodes, 6)),
-    )
+    size, room = trial.shape[0], CONTACTS_PER_NODE * (trial.shape[0] // 2)
+    system = System(np.empty(size), np.empty((size, WIDTH)), np.zeros(len(terms.rows)), np.empty((room, 6)))
     gradient = system.gradient
     lever = math.sqrt(bodies.needle.tip[0] ** 2 + bodies.needle.tip[1] ** 2)  # of an angle as a way of the tip
     current, move = trial.copy(), np.inf
@@ -173,8 +347,9 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
                 return -1, np.inf, force
         step = -gradient
         back_substitute(chol, step)
-        couple(chol, terms.pairs, system.second, 3 if driven else 0, step)
+        couple(chol, terms.rows, system.second, 3 if driven else 0, step)
         slope, move = float(np.dot(gradient, step)), _largest(step, lever)
+        rounding = 1e-10 * abs(energy) + 1e-18  # J; the energy is a sum of larger terms, or moves by the tolerance
         if not max(abs(slope), move) < np.inf:
             return -1, np.inf, force
         # Between a place that is low enough and one that is not, until it is no more as steep as at the start: one that
@@ -188,7 +363,7 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
             if move <= TOLERANCE:
                 return iteration, move, force
             new_slope = float(np.dot(gradient, step))
-            if new > energy + 1e-4 * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
+            if new > energy + 1e-4 * part * slope + rounding:
                 high, high_energy, high_slope = part, new, new_slope
             elif new_slope < 0.9 * slope and MIN_PART < high - part < np.inf:
                 low, low_energy, low_slope = part, new, new_slope
@@ -253,25 +428,12 @@ class RigDynamics:
         self._before, self._last_dt = self._q.copy(), 0.0
         self._largest_step = largest_step
         self._shapes = surface.packed()
-        self._rod = Rod(
-            length,
-            thread.stretching_stiffness,
-            thread.bending_stiffness,
-            thread.drag_across,
-            thread.drag_along,
-            0.5 * thread.diameter + surface.skin,
-        )
-        clamp = thread.bending_stiffness / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
-        # At most 48 points of the outline touch.
-        touching = min(int(2.0 * needle.length / needle.diameter) + 2, 48)
-        self._needle = Needle(
-            needle.resistance,
-            needle.tip,
-            needle.pole,
-            needle.outline(touching),
-            0.5 * needle.diameter + surface.skin,
-            clamp,
-        )
+        stretching, bending, reach = thread.stretching_stiffness, thread.bending_stiffness, 0.5 * thread.diameter
+        self._rod = Rod(length, stretching, bending, thread.drag_across, thread.drag_along, reach + surface.skin)
+        clamp = bending / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
+        outline = needle.outline(min(int(2.0 * needle.length / needle.diameter) + 2, 48))
+        radius = 0.5 * needle.diameter + surface.skin
+        self._needle = Needle(needle.resistance, needle.tip, needle.pole, outline, radius, clamp)
         self._rows = np.empty((CONTACTS_PER_NODE * (thread.segments + 1), 6))
         self._pairs = np.empty((PAIRS_PER_NODE * (thread.segments + 1), 6))
         self._move, self._held = 0.0, np.zeros(0)
@@ -291,7 +453,7 @@ class RigDynamics:
     @property
     def tip(self) -> Vector:
         """The needle's tip, shape (2,) [m]."""
-        return self._tip_of(self._q)
+        return np.asarray(self._q[1:3] + self._turned(self._q, self._needle.tip))
 
     @property
     def body(self) -> Points:
@@ -345,11 +507,10 @@ class RigDynamics:
             SolverError: Newton's iteration did not converge, however small the step; the state is that of the last
                 step that did.
         """
-        amperes = np.asarray(currents, dtype=np.float64)
-        if not np.array_equal(amperes, self._held):
+        if not np.array_equal(currents, self._held):
             # Speeds jump with currents: a formula that looks back over the jump would lag by part of a step.
-            self._held, self._last_dt = amperes.copy(), 0.0
-        return self._integrate(dt, amperes, None, max_iterations)
+            self._held, self._last_dt = np.array(currents, dtype=np.float64), 0.0
+        return self._integrate(dt, self._held, None, max_iterations)
 
     def drive(self, tail: ArrayLike, heading: float, dt: float) -> None:
         """Move the needle at constant velocity and turn rate, and the thread with it.
@@ -414,37 +575,37 @@ class RigDynamics:
         trial = q + w * (q - before)
         flux = np.zeros((2, 2))
         if currents is not None and self.field is not None:
-            flux = np.array([self.field.per_current(at) @ currents for at in (trial[1:3], self._tip_of(trial))])
+            tip = trial[1:3] + self._turned(trial, needle.tip)
+            flux = np.array([self.field.per_current(at) @ currents for at in (trial[1:3], tip)])
         if pose is not None:
             trial[:3] = pose
         c, s = math.cos(trial[0]), math.sin(trial[0])
         turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
         scale = (1.0 + 2.0 * w) / ((1.0 + w) * h)  # 1 / (beta dt)
-        pairs = find_pairs(q, rod, shapes, self._pairs) if shapes.self_contact else 0
-        if pairs < 0:
-            return False
-        friction = np.empty((0, 5))
+        rows, crossed = np.empty((0, 6)), np.empty((0, 0), np.bool_)
+        if shapes.self_contact:
+            crossed = crossings(q)
+            if (pairs := find_pairs(q, rod, shapes, crossed, self._pairs)) < 0:
+                return False
+            rows = self._pairs[:pairs]
         if shapes.friction > 0.0:
-            friction = find_friction(self._rows[: find_contacts(q, rod, shapes, self._rows)], shapes)
+            contacts = self._rows[: find_contacts(q, rod, shapes, self._rows)]
+            rows = np.vstack([rows, find_friction(contacts, shapes)])
         terms = StepTerms(
             begin=q,
             rest=((1.0 + w) ** 2 * q - w**2 * before) / (1.0 + 2.0 * w),
             drag=drag_matrices(trial, rod, scale),
             turned=scale * turn @ needle.resistance @ turn.T,
             field=flux,
-            friction=friction,
             slip=SLIP_SPEED * h,
-            pairs=self._pairs[:pairs],
+            rows=rows,
         )
         iterations, self._move, residual = minimise(trial, Bodies(needle, rod, shapes), terms, currents is None)
-        if iterations < 0 or (shapes.self_contact and crosses_anew(q, trial)):
+        if iterations < 0 or (shapes.self_contact and (crossings(trial) & ~crossed).any()):
             return False
         self._before, self._q, self._last_dt = q, trial, h
         self.time, self.residual, self.iterations = self.time + h, residual, self.iterations + iterations
         return True
-
-    def _tip_of(self, q: Vector) -> Vector:
-        return np.asarray(q[1:3] + self._turned(q, self._needle.tip))
 
     @staticmethod
     def _turned(q: Vector, vector: Vector) -> Vector:

@@ -10,9 +10,16 @@ A node near a segment of the same thread is kept on its side by the gap
     g(q) = n . (x_k - (1 - s) x_j - s x_{j+1}) - diameter,    energy k / 2 g^2 below 0
 
 whose place s and normal n are those of the start of a step, as the node is not far from there at its end: so g is
-linear. With friction, the slip of the two along the tangent adds what `friction` has for other contacts. These terms
-couple nodes far apart, which is beyond the band of second derivatives: Newton's step is corrected for them by solving
-for their forces first, as many unknowns as there are contacts.
+linear, as is the slip along the tangent. These terms couple nodes far apart, which is beyond the band of second
+derivatives: Newton's step is corrected for them by solving for their forces first, as many unknowns as there are
+contacts.
+
+**Friction** follows Coulomb's law with the normal forces at the start of a step. A contact that pushes with the force N
+adds, for its slip s along the tangent since then,
+
+    mu N (sqrt(s^2 + e^2) - e),    e = SLIP_SPEED dt
+
+to the energy of the step: a force of mu N s / sqrt(s^2 + e^2) against the slip.
 
 Source: Sherman and Morrison 1950, Woodbury 1950. Deviation: none.
 """
@@ -25,17 +32,17 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts, segment_contacts
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline
+from magnetosuture_thread.rig.contact import Shapes, Vector, clear, point_contacts, segment_contacts, write_row
 
-SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
 WIDTH = 6  # of the band: half-width and diagonal
 NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
 
 
 class NeedleJoint(str, Enum):
-    """How the thread is tied to the needle's tail."""
+    """The joint of the thread and the needle's tail."""
 
     PINNED = "pinned"
     CLAMPED = "clamped"
@@ -84,6 +91,37 @@ class Rod(NamedTuple):
     across: float
     along: float
     radius: float
+
+
+class StepTerms(NamedTuple):
+    """Terms that one step adds to the elastic energy, N = 2n + 3 unknowns.
+
+    Attributes:
+        begin: state at the start of the step, from which slip is measured, shape (N,) [rad, m].
+        rest: state from which drag is counted, shape (N,).
+        drag: of the thread's nodes, see `drag_matrices`.
+        turned: resistance of the needle to (theta, x, y) in the dish's frame, shape (3, 3).
+        field: flux density at tail and tip, shape (2, 2) [T].
+        slip: that smooths friction [m].
+        rows: of friction and of contact of the thread with itself, see `add_rows`.
+    """
+
+    begin: Vector
+    rest: Vector
+    drag: Vector
+    turned: Vector
+    field: Vector
+    slip: float
+    rows: Vector
+
+
+class System(NamedTuple):
+    """Gradient, band of second derivatives, and second derivatives of rows beyond it; rows of contacts to work in."""
+
+    gradient: Vector
+    band: Vector
+    second: Vector
+    contacts: Vector
 
 
 @compiled
@@ -199,17 +237,14 @@ def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     count = 0
     for a in range(3, q.shape[0] - 1, 2):
         if not clear(q[a], q[a + 1], rod.radius, shapes):
-            found = point_contacts(q[a], q[a + 1], rod.radius, shapes, rows[count:])
-            for row in range(count, count + found):
-                rows[row, 0], rows[row, 1] = a, -1.0
-            count += found
+            count = point_contacts(a, q[a], q[a + 1], rod.radius, shapes, rows, count)
     if shapes.discs.shape[0] + shapes.boxes.shape[0] == 0:
         return count
     for a in range(1, q.shape[0] - 2, 2):
         ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
         reach = rod.radius + 0.75 * math.sqrt(ex * ex + ey * ey)
         if not clear(q[a] + 0.5 * ex, q[a + 1] + 0.5 * ey, reach, shapes):
-            count += segment_contacts(q, a, rod.segment, rod.radius, shapes, rows[count:])
+            count = segment_contacts(q, a, rod.segment, rod.radius, shapes, rows, count)
     return count
 
 
@@ -250,45 +285,10 @@ def add_contact(q: Vector, k: float, rows: Vector, gradient: Vector, band: Vecto
 
 
 def find_friction(contacts: Vector, shapes: Shapes) -> Vector:
-    """Return where friction acts in a step, by Coulomb's law with the normal forces at the start of the step.
-
-    A contact that pushes with the force N at the start of a step adds, for its slip s = t . (x - x_start) along it,
-
-        mu N (sqrt(s^2 + e^2) - e),    e = SLIP_SPEED dt
-
-    to the energy of the step: a force of mu N s / sqrt(s^2 + e^2) against the slip.
-
-    Args:
-        contacts: at the start, the rows of `find_contacts`.
-        shapes: what can be touched, with its friction.
-
-    Returns:
-        Index of the first unknown, place on the segment (0 at a node), t_x, t_y and mu N [N], shape (k, 5).
-    """
+    """Return the rows of friction on surfaces, see `add_rows`, from those of `find_contacts` as a step begins."""
     a, s, depth, nx, ny, _ = contacts.T
-    return np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
-
-
-@compiled
-def add_friction(q: Vector, start: Vector, slip: float, friction: Vector, gradient: Vector, band: Vector) -> float:
-    """Add the friction of a step from `start` to q; `slip` is e [m]."""
-    energy = 0.0
-    for row in range(friction.shape[0]):
-        a, s, limit = int(friction[row, 0]), friction[row, 1], friction[row, 4]
-        tx, ty = friction[row, 2], friction[row, 3]
-        w = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
-        count = 2 if s == 0.0 else 4
-        along = 0.0
-        for r in range(count):
-            along += w[r] * (q[a + r] - start[a + r])
-        root = math.sqrt(along * along + slip * slip)
-        energy += limit * (root - slip)
-        force, second = limit * along / root, limit * slip * slip / root**3
-        for r in range(count):
-            gradient[a + r] += force * w[r]
-            for c in range(r + 1):
-                band[a + r, r - c] += second * w[r] * w[c]
-    return energy
+    limit = shapes.friction * shapes.stiffness * depth
+    return np.column_stack([np.where(s < 0.0, a, 0.0), np.where(s < 0.0, 0.0, a), s, -ny, nx, limit])
 
 
 @compiled
@@ -327,37 +327,25 @@ def back_substitute(band: Vector, right: Vector) -> None:
 
 
 @compiled
-def _side(q: Vector, a: int, b: int, c: int) -> float:
-    """Return twice the area of the triangle of three nodes, by their first unknowns, positive counter-clockwise."""
-    return float((q[b] - q[a]) * (q[c + 1] - q[a + 1]) - (q[b + 1] - q[a + 1]) * (q[c] - q[a]))
+def crossings(q: Vector) -> NDArray[np.bool_]:
+    """Return which segments cross each other, shape (n, n)."""
+    segments = q.shape[0] // 2 - 1
+    side = np.empty((segments, segments + 1))  # of the line of each segment, on which each node is
+    for i in range(segments):
+        a = 2 * i + 1
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+        for k in range(segments + 1):
+            side[i, k] = ex * (q[2 * k + 2] - q[a + 1]) - ey * (q[2 * k + 1] - q[a])
+    crossed = np.zeros((segments, segments), np.bool_)
+    for i in range(segments):
+        for j in range(segments):
+            crossed[i, j] = side[i, j] * side[i, j + 1] < 0.0 and side[j, i] * side[j, i + 1] < 0.0
+    return crossed
 
 
 @compiled
-def _cross(q: Vector, a: int, b: int) -> bool:
-    """Return whether the segments from two nodes on cross, by the nodes' first unknowns; one that is none does not."""
-    if min(a, b) < 1 or max(a, b) + 3 >= q.shape[0] or abs(a - b) < 4:
-        return False
-    return bool(
-        _side(q, a, a + 2, b) * _side(q, a, a + 2, b + 2) < 0.0
-        and _side(q, b, b + 2, a) * _side(q, b, b + 2, a + 2) < 0.0
-    )
-
-
-@compiled
-def crosses_anew(start: Vector, end: Vector) -> bool:
-    """Return whether two segments cross at the end of a step that did not at its start."""
-    for a in range(1, end.shape[0] - 6, 2):
-        for b in range(a + 4, end.shape[0] - 2, 2):
-            if max(end[a], end[a + 2]) < min(end[b], end[b + 2]) or max(end[b], end[b + 2]) < min(end[a], end[a + 2]):
-                continue
-            if _cross(end, a, b) and not _cross(start, a, b):
-                return True
-    return False
-
-
-@compiled
-def find_pairs(q: Vector, rod: Rod, shapes: Shapes, pairs: Vector) -> int:
-    """Write what of the thread is near itself at the start of a step.
+def find_pairs(q: Vector, rod: Rod, shapes: Shapes, crossed: NDArray[np.bool_], rows: Vector) -> int:
+    """Write what of the thread is near itself at the start of a step, see `add_rows`.
 
     What crosses itself already is free to move apart.
 
@@ -365,44 +353,39 @@ def find_pairs(q: Vector, rod: Rod, shapes: Shapes, pairs: Vector) -> int:
         q: state at the start, shape (N,) [rad, m].
         rod: the thread.
         shapes: stiffness and friction.
-        pairs: gets the first unknown of the node and of the segment, place on it, direction, and `NORMAL` or the
-            limit of friction [N], shape (p, 6).
+        crossed: see `crossings`.
+        rows: written, shape (p, 6).
 
     Returns:
         How many there are, -1 if there is no room.
     """
-    count, size, diameter = 0, q.shape[0], 2.0 * rod.radius
-    for a in range(1, size - 1, 2):
-        for b in range(1, size - 3, 2):
-            between = min(abs(a - b), abs(a - b - 2)) // 2
+    count, segments, diameter = 0, crossed.shape[0], 2.0 * rod.radius
+    for i in range(segments + 1):
+        for j in range(segments):
             # Places less than half a circle of thread apart cannot touch.
-            if a == b or a == b + 2 or between * rod.segment <= 0.5 * math.pi * diameter:
+            if i in (j, j + 1) or min(abs(i - j), abs(i - j - 1)) * rod.segment <= 0.5 * math.pi * diameter:
                 continue
+            a, b = 2 * i + 1, 2 * j + 1
             ex, ey, dx, dy = q[b + 2] - q[b], q[b + 3] - q[b + 1], q[a] - q[b], q[a + 1] - q[b + 1]
-            square = ex * ex + ey * ey
-            s = min(max((dx * ex + dy * ey) / square, 0.0), 1.0)
+            s = min(max((dx * ex + dy * ey) / (ex * ex + ey * ey), 0.0), 1.0)
             nx, ny = dx - s * ex, dy - s * ey
             gap = math.sqrt(nx * nx + ny * ny)
             # A node that is farther than half a segment from touching has no gap in a step.
-            if not 0.0 < gap < diameter + 0.5 * rod.segment or _cross(q, a, b) or _cross(q, a - 2, b):
+            if not 0.0 < gap < diameter + 0.5 * rod.segment:
                 continue
-            if count + 2 > pairs.shape[0]:
+            if (i < segments and crossed[i, j]) or (i > 0 and crossed[i - 1, j]):
+                continue
+            if count + 2 > rows.shape[0]:
                 return -1
-            nx, ny = nx / gap, ny / gap
-            _write(pairs[count], a, b, s, nx, ny, NORMAL)
-            count += 1
+            nx, ny, segment = nx / gap, ny / gap, float(b)
+            count = write_row(rows, count, a, segment, s, nx, ny, NORMAL)
             if gap < diameter and shapes.friction > 0.0:
-                _write(pairs[count], a, b, s, -ny, nx, shapes.friction * shapes.stiffness * (diameter - gap))
-                count += 1
+                limit = shapes.friction * shapes.stiffness * (diameter - gap)
+                count = write_row(rows, count, a, segment, s, -ny, nx, limit)
     return count
 
 
-@compiled
-def _write(row: Vector, a: int, b: int, s: float, x: float, y: float, limit: float) -> None:
-    row[0], row[1], row[2], row[3], row[4], row[5] = a, b, s, x, y, limit
-
-
-@compiled
+@compiled_inline
 def _place(row: Vector, r: int) -> tuple[int, float]:
     """Return one of the six unknowns of a row, by its number, and the derivative of the row's gap or slip by it."""
     s, weight = row[2], row[3 + r % 2]
@@ -412,52 +395,41 @@ def _place(row: Vector, r: int) -> tuple[int, float]:
 
 
 @compiled
-def add_pairs(
-    q: Vector,
-    start: Vector,
-    slip: float,
-    diameter: float,
-    stiffness: float,
-    pairs: Vector,
-    second: Vector,
-    gradient: Vector,
-) -> float:
-    """Add energy and gradient of all rows, and write the second derivative of each by its gap or slip.
+def add_rows(q: Vector, terms: StepTerms, rod: Rod, stiffness: float, system: System) -> float:
+    """Add what depends on a gap or slip that is linear in a step: contact of the thread with itself, and all friction.
 
-    Args:
-        q: state, shape (N,).
-        start: at the start of the step.
-        slip: that smooths friction [m].
-        diameter: of the thread [m].
-        stiffness: k [N/m].
-        pairs: of `find_pairs`, shape (p, 6).
-        second: written, shape (p,).
-        gradient: added to, shape (N,).
+    A row has the first unknown of a node and of a segment, 0 for neither, the place on the segment, a direction, and
+    the limit of friction [N], `NORMAL` for a gap. Where it has a node and a segment, its second derivative by gap or
+    slip goes to `system.second`, else into the band.
     """
-    energy = 0.0
-    for row in range(pairs.shape[0]):
-        along, limit = 0.0, pairs[row, 5]
-        for r in range(6):
-            at, weight = _place(pairs[row], r)
-            along += weight * (q[at] - (start[at] if limit != NORMAL else 0.0))
+    energy, diameter = 0.0, 2.0 * rod.radius
+    for k in range(terms.rows.shape[0]):
+        row, along = terms.rows[k], 0.0
+        first, last, limit = 0 if row[0] > 0.0 else 2, 6 if row[1] > 0.0 else 2, row[5]
+        for r in range(first, last):
+            at, weight = _place(row, r)
+            along += weight * (q[at] - (terms.begin[at] if limit != NORMAL else 0.0))
         if limit == NORMAL:
             depth = max(diameter - along, 0.0)
             energy += 0.5 * stiffness * depth * depth
-            force, second[row] = -stiffness * depth, stiffness if depth > 0.0 else 0.0
+            force, second = -stiffness * depth, stiffness if depth > 0.0 else 0.0
         else:
-            root = math.sqrt(along * along + slip * slip)
-            energy += limit * (root - slip)
-            force, second[row] = limit * along / root, limit * slip * slip / root**3
-        if force != 0.0:
-            for r in range(6):
-                at, weight = _place(pairs[row], r)
-                gradient[at] += force * weight
+            root = math.sqrt(along * along + terms.slip * terms.slip)
+            energy += limit * (root - terms.slip)
+            force, second = limit * along / root, limit * terms.slip * terms.slip / root**3
+        system.second[k] = second if last - first == 6 else 0.0
+        for r in range(first, last if second > 0.0 else first):
+            at, weight = _place(row, r)
+            system.gradient[at] += force * weight
+            for c in range(first, r + 1 if last - first < 6 else first):
+                before, share = _place(row, c)
+                system.band[at, at - before] += second * weight * share
     return energy
 
 
 @compiled
 def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: Vector) -> None:
-    """Correct a step, found with the factor of the band alone, for the rows' second derivatives.
+    """Correct a step, found with the factor of the band alone, for the second derivatives of rows beyond it.
 
         (S^-1 + W A^-1 W') f = W step,    step - A^-1 W' f
 
@@ -465,9 +437,9 @@ def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: V
 
     Args:
         chol: the factor.
-        pairs: of `find_pairs`.
-        second: of `add_pairs`.
-        first_free: the first unknown; those before are given.
+        pairs: the rows, see `add_rows`.
+        second: their second derivatives.
+        first_free: the first unknown; those before are known.
         step: corrected, shape (N,).
     """
     rows, size = np.empty(second.shape[0], np.int64), 0
