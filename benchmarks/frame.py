@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from benchmarks.report import figures_table
 from magnetosuture_thread.geometry.polyline import lay_behind_needle
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.setups import read_setup
@@ -34,13 +35,14 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     calls = count_frame()
     figures: dict[str, Any] = {}
     for folder in (*sorted({file.partition("/")[0] for file, _ in calls}), ""):
-        own = {key: count for key, count in calls.items() if key[0].startswith(folder)}
-        files = {file for file, _ in own}
-        figures[folder or "all"] = {"files": len(files), "functions": len(own), "calls": sum(own.values())}
+        inside = {key: count for key, count in calls.items() if key[0].startswith(folder)}
+        sums = {"files": len({file for file, _ in inside}), "functions": len(inside), "calls": sum(inside.values())}
+        figures[folder or "all"] = sums
     for (file, function), count in sorted(calls.items()) if options.list else ():
         console.print(f"{count:6d}  {file}  {function}", soft_wrap=True)
-    for folder, found in figures.items():
-        console.print(f"{folder:16}" + ", ".join(f"{count:4d} {name}" for name, count in found.items()))
+    rows = [{"folder": folder, **sums} for folder, sums in figures.items()]
+    names = ("folder", "files", "functions", "calls")
+    console.print(figures_table("one frame", rows, {name: f"{{{name}}}" for name in names}))
     return figures, True
 
 

@@ -7,21 +7,12 @@ from typing import Any
 
 from rich.table import Table
 
+from magnetosuture_thread.commands.command import make_table
+
 
 def figures_table(
     title: str, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], caption: str = ""
 ) -> Table:
-    """Return a table with a row for each mapping of figures.
-
-    Args:
-        title: of the table.
-        rows: the figures of each row by their keys.
-        columns: how a cell is written, by the column's name: `{error_percent:.2f}` for example.
-        caption: below it.
-    """
-    table = Table(title=title, caption=caption)
-    for index, name in enumerate(columns):
-        table.add_column(name, justify="right" if index else "left")
-    for row in rows:
-        table.add_row(*(cell.format(**row) for cell in columns.values()))
-    return table
+    """Return a table with a row for each mapping of figures; `columns` has each column's cell, as `{error:.2f}`."""
+    cells = ([cell.format(**row) for cell in columns.values()] for row in rows)
+    return make_table(title, tuple(columns), cells, caption)

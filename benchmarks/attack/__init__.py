@@ -12,6 +12,7 @@ not leave this machine. No node may end or be silent for more than 0.5 s, and th
 from __future__ import annotations
 
 import argparse
+import random
 from typing import Any
 
 from rich.console import Console
@@ -38,10 +39,15 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
 
             figures, lines = attack_bags(options.count, options.seed, advance)
         else:
-            from benchmarks.attack.nodes import attack_nodes  # needs ROS
+            from benchmarks.attack.nodes import Attack  # needs ROS
 
-            figures, lines = attack_nodes(options.count, options.seed, advance)
+            attack, with_clock = Attack(options.count, advance), round(0.25 * options.count)
+            # First by the time of the day, then by a simulated clock.
+            for number, clock in ((options.count - with_clock, False), (with_clock, True)):
+                if number:
+                    attack.attack(number, random.Random(f"{options.seed} {clock}"), clock)
+            figures, lines = attack.figures()
     for line in (*lines, *figures["broken"][:MAX_LINES]):
         make_log(console)(line)
-    about = {"target": options.target, "count": options.count, "seed": options.seed}
-    return {**about, **figures}, not figures["broken"]
+    chosen = {"target": options.target, "count": options.count, "seed": options.seed}
+    return {**chosen, **figures}, not figures["broken"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -13,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.vision.dish import FoundDish, see_dish
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.dish import FoundDish
 
 Image = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -213,27 +211,3 @@ def ellipse_error(found: FoundDish, diameter: float, points: NDArray[np.float64]
 def photo_of(name: str, index: int, seed: int) -> Photograph:
     """Return a photograph of a class with a number."""
     return PHOTOGRAPHS[name](np.random.default_rng([seed, index, len(name), *name.encode()]))
-
-
-def measure_photographs(names: list[str], count: int, seed: int) -> dict[str, Any]:
-    """Look for the dish in photographs of each class.
-
-    Returns:
-        A row of figures of each class: in how many a dish is found, and of these, how many with an ellipse within
-        `RIGHT` of the wall's inner edge, at the floor or at the top; and the CPU time of a frame.
-    """
-    rows = []
-    settings = VisionTrackerSettings()
-    for name in names:
-        found, right, times = 0, 0, []
-        for index in range(count):
-            photo = photo_of(name, index, seed)
-            began = time.process_time()
-            dish = see_dish(photo.image, settings, DIAMETER)
-            times.append(1e3 * (time.process_time() - began))
-            if dish is not None:
-                found += 1
-                right += min(ellipse_error(dish, DIAMETER, at) for at in (photo.floor, photo.top)) < RIGHT
-        figures = {"found": found, "right": right, "median_ms": float(np.median(times)), "max_ms": max(times)}
-        rows.append({"name": name, "count": count, **figures})
-    return {"count": count, "seed": seed, "rows": rows}

@@ -18,7 +18,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 
@@ -54,10 +53,10 @@ class TwoHosts:
         if missing:
             raise GraphError(f"{', '.join(missing)}: not found; install iproute2 and util-linux")
         devices = [f"{host}_{os.getpid() % 100_000}" for host in ("r", "d")]
-        command = [sys.executable, "-m", "benchmarks.network.hosts", *devices]
+        command = [sys.executable, "-m", "benchmarks.hosts", *devices]
         try:
             self._cable = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-            if self._answer() != "ready":
+            if self._cable.stdout is None or self._cable.stdout.readline() != "ready\n":
                 raise GraphError("no TAP device can be made; that takes root's rights and /dev/net/tun")
             for number, (host, device) in enumerate(zip(self._hosts, devices, strict=True), 1):
                 _run("ip", "netns", "add", host)
@@ -85,14 +84,10 @@ class TwoHosts:
         """
         assert self._cable is not None
         assert self._cable.stdin is not None
+        assert self._cable.stdout is not None
         self._cable.stdin.write(f"{command}\n")
         self._cable.stdin.flush()
-        self._answer()
-
-    def _answer(self) -> str:
-        assert self._cable is not None
-        assert self._cable.stdout is not None
-        return self._cable.stdout.readline().strip()
+        self._cable.stdout.readline()
 
     def _remove(self) -> None:
         if self._cable is not None:
@@ -116,29 +111,26 @@ def _join(path: str) -> None:
         os.close(descriptor)
 
 
-def carry(
-    ends: tuple[int, int], inlet: int, set_carrier: Callable[[bool], object], answer: Callable[[str], None]
-) -> None:
-    """Take frames from each of two devices to the other until the commands end.
+def main(*names: str) -> None:
+    """Make two TAP devices, which last as long as this process, and take frames from each to the other.
 
-    Frames that are on their way when the cable is pulled arrive all the same.
-
-    Args:
-        ends: file descriptors of the devices, which do not block.
-        inlet: file descriptor that the commands come from.
-        set_carrier: tells the second device whether it is connected.
-        answer: called once a command is executed.
+    Frames that are on their way when the cable is pulled arrive all the same. It ends with the commands.
     """
+    ends = [os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK) for _ in names]
+    for end, name in zip(ends, names, strict=True):
+        fcntl.ioctl(end, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TAP_NO_PI))
+    print("ready", flush=True)
     waiting: list[tuple[float, int, int, bytes]] = []  # due, order, end that gets it, frame
     pulled, delay, loss, commands, chance, order = False, 0.0, 0.0, b"", random.Random(1), count()
+    inlet = sys.stdin.fileno()
     while True:
         left = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
         ready, _, _ = select.select([*ends, inlet], [], [], left)
-        for end in (0, 1):
-            if ends[end] in ready:
-                frame = os.read(ends[end], 65536)
+        for index in (0, 1):
+            if ends[index] in ready:
+                frame = os.read(ends[index], 65536)
                 if not pulled and chance.random() >= loss and len(waiting) < 10_000:
-                    heapq.heappush(waiting, (time.monotonic() + delay, next(order), 1 - end, frame))
+                    heapq.heappush(waiting, (time.monotonic() + delay, next(order), ends[1 - index], frame))
         if inlet in ready:
             if not (read := os.read(inlet, 4096)):
                 return
@@ -148,31 +140,12 @@ def carry(
                     delay, loss = map(float, values)
                 else:
                     pulled = name == "pull"
-                    set_carrier(not pulled)
-                answer("")
+                    fcntl.ioctl(ends[1], _TUNSETCARRIER, struct.pack("i", not pulled))
+                print(flush=True)
         while waiting and waiting[0][0] <= time.monotonic():
             _, _, end, frame = heapq.heappop(waiting)
             with suppress(OSError):  # the host has taken its device down
-                os.write(ends[end], frame)
-
-
-def _make_device(name: str) -> int:
-    descriptor = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
-    fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TAP_NO_PI))
-    return descriptor
-
-
-def main(first: str, second: str) -> None:
-    """Make two TAP devices, which last as long as this process, and connect them."""
-    ends = _make_device(first), _make_device(second)
-    print("ready", flush=True)
-    carrier = ends[1], _TUNSETCARRIER
-    carry(
-        ends,
-        sys.stdin.fileno(),
-        lambda present: fcntl.ioctl(*carrier, struct.pack("i", present)),
-        lambda text: print(text, flush=True),
-    )
+                os.write(end, frame)
 
 
 if __name__ == "__main__":
