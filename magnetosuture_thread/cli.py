@@ -19,7 +19,8 @@ Predicts where a suture thread goes behind a magnetically steered needle.
 
 Research software, no medical device. Lengths are in metres and times in seconds throughout.
 """
-# Name and summary of each command. `commands/NAME.py` is imported when the command is given, so that --help is quick.
+# Name and summary of each command. The file of `commands` is imported when the command is given, so that --help is
+# quick; what it does after a hyphen is `add_...` in that file.
 COMMANDS = {
     "replay": "play a recorded bag through the live graph, or offline",
     "render": "write a bag of simulated camera frames, or poses",
@@ -55,7 +56,9 @@ def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentPa
     for name, summary in COMMANDS.items():
         own = subparsers.add_parser(name, help=summary)
         if name in names:
-            import_module(f"magnetosuture_thread.commands.{name.replace('-', '_')}").add(own)
+            verb, _, kind = name.partition("-")
+            module = import_module(f"magnetosuture_thread.commands.{verb}")
+            getattr(module, f"add_{kind}" if kind else "add")(own)
     return parser
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import re
 import time
@@ -11,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +111,8 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
             tracker.set_lens(frame.lens)
             began = time.thread_time()
             track = _look(tracker, frame, source.is_sequence)
-            rows.append(_row(frame, track, time.thread_time() - began))
-            if source.unverified:
-                rows[-1]["unverified"] = source.unverified
+            unverified = {"unverified": source.unverified} if source.unverified else {}
+            rows.append({**_row(frame, track, time.thread_time() - began), **unverified})
             if writer is not None and frame.image is not None:
                 drawn = draw_overlay(frame.undistorted(), track, settings.needle_length, frame.name)
                 if track.view is not None:
@@ -231,7 +230,16 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
         raise BagError(path, "is no video and no folder of frames of one size, so --rate has no meaning for it")
     source = FrameSource(is_sequence=is_bag or is_video or is_folder)
     if is_bag:
-        recording, camera = _open_recording(Bag(path, remap=dict(options.remap)), log)
+        bag = Bag(path, remap=dict(options.remap))
+        recording = Recording(bag)
+        doubt = f"is unverified: {bag.salvaged_without_checksum}" if bag.salvaged_without_checksum else ""
+        for line in (str(bag.damage or ""), doubt or bag.has_no_checksum, *recording.remarks):
+            if line:
+                log(f"{recording.path} {line}")
+        camera = recording.camera
+        if camera is None:
+            topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+            raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
         if recording.rectified and lens is not None:
             raise BagError(path, f"has rectified frames on {recording.rectified}; omit --camera-info")
         source.count, source.unverified = recording.counts[camera.recorded], recording.salvaged_without_checksum
@@ -250,19 +258,6 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
             for index, (name, file) in enumerate(zip(source.names, files, strict=True))
         )
     return source
-
-
-def _open_recording(bag: Bag, log: Log) -> tuple[Recording, Channel]:
-    """Return a bag with its camera, and log what is unusual about it."""
-    recording = Recording(bag)
-    doubt = f"is unverified: {bag.salvaged_without_checksum}" if bag.salvaged_without_checksum else bag.has_no_checksum
-    for line in (str(bag.damage or ""), doubt, *recording.remarks):
-        if line:
-            log(f"{recording.path} {line}")
-    if recording.camera is None:
-        topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
-        raise BagError(bag.path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
-    return recording, recording.camera
 
 
 def _filmed(source: FrameSource, path: Path, video: Video, lens: Lens | None) -> Iterator[FrameFile]:
@@ -293,7 +288,7 @@ def _recorded(source: FrameSource, recording: Recording, camera: Channel, overri
 
 def _median_rate(recording: Recording, camera: Channel) -> float:
     """Return the frame rate by the median interval of a bag's first frames' stamps [1/s]."""
-    intervals = 1e-9 * np.diff([stamp_of(record) for record in islice(recording.records([camera]), 300)])
+    intervals = 1e-9 * np.diff([stamp_of(record) for record in itertools.islice(recording.records([camera]), 300)])
     if not np.any(intervals > 0.0):
         return 30.0
     # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
@@ -343,13 +338,11 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
         names: that may come again.
         form: of a name with its number, 2 and up, for example `{}_{}`.
     """
-    taken, given = dict[str, None](), set(names)
+    taken = dict[str, None]()
     for name in names:
-        own, number = name, 1
-        while own in taken or (number > 1 and own in given):
-            number += 1
-            own = form.format(name, number)
-        taken[own] = None
+        others = (form.format(name, number) for number in itertools.count(2))
+        free = name if name not in taken else next(o for o in others if o not in taken and o not in names)
+        taken[free] = None
     return list(taken)
 
 
