@@ -14,7 +14,6 @@ from typing import Any
 from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError, calibrate_bags
-from magnetosuture_thread.calibration.result import bag_table, calibration_lines, parameter_table
 from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.track import open_frames
@@ -74,12 +73,51 @@ def run_calibrate(options: argparse.Namespace, terminal: command.Terminal) -> in
         result = calibrate_bags(**chosen, log=terminal.log, progress=advance)
     values = result.to_json()
     command.write_json(options.json, values)
-    terminal.print(parameter_table(values))
-    terminal.print(bag_table(values))
-    for line in calibration_lines(values):
-        terminal.log(line)
+    terminal.print(_parameter_table(values))
+    terminal.print(_bag_table(values))
+    for warning in values["warnings"]:
+        terminal.log(f"warning: {warning}")
+    if simulated := [row["name"] for row in values["bags"] if row["simulated"]]:
+        terminal.log(f"simulated: {', '.join(simulated)}")
     terminal.log(f"parameters: {options.output}")
     return command.DONE if result.finished else 130  # as shells have it
+
+
+def _parameter_table(figures: dict[str, Any]) -> Table:
+    """Return a row for each number, as `CalibrationResult.to_json` gives them."""
+    rows = []
+    for row in figures["parameters"]:
+        scale, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
+        value = f"{scale * row['value']:.4g}" + (" ?" if row["reason"] else "")
+        interval = "-" if row["low"] is None else f"{scale * row['low']:.3g} to {scale * row['high']:.3g}"
+        rows.append(
+            (f"{row['name']} [{unit}]" if unit else row["name"], value, interval, f"{scale * row['start']:.4g}")
+        )
+    if (attachment := figures["attachment"]) is not None:
+        rows.append(("attachment", attachment["value"] + " ?" * bool(attachment["reason"]), "-", attachment["start"]))
+    title = f"{figures['material']}, formulation {figures['formulation']}"
+    title += "" if figures["finished"] else ": best so far, not finished"
+    columns = ("parameter", "value", "95 % interval", "setup")
+    return command.make_table(title, columns, rows, "? cannot be identified in this data")
+
+
+def _bag_table(figures: dict[str, Any]) -> Table:
+    """Return a row for each bag: prediction errors before and after, and by the other bags."""
+    bags = figures["bags"]
+    silences = [f"{row['name']} is {row['silence']}" for row in bags if row["silence"]]
+    caption = "; ".join(["mean over time of the mean distance of the nodes, % of the length", *silences])
+    keys = ["before", "after", *(["held_out"] if len(bags) > 1 else [])]
+    names = {key: key.replace("_", "\n") for key in keys}
+    if figures["against"] == "seen" and any(row["truth_after"] is not None for row in bags):
+        # On lines of its own, as eight columns must fit into a terminal's 80.
+        names |= {f"truth_{key}": f"ground\ntruth\n{key.replace('_', ' ')}" for key in keys}
+    rows = [
+        (row["name"], str(row["frames"]), *("-" if row[key] is None else f"{row[key]:.3f}" for key in names))
+        for row in bags
+    ]
+    fitted = "the measured thread" if figures["against"] == "seen" else "ground truth"
+    title = f"prediction error, fitted to {fitted}"
+    return command.make_table(title, ("bag", "frames", *names.values()), rows, caption)
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:

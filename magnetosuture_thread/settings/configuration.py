@@ -14,7 +14,7 @@ import difflib
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -28,8 +28,6 @@ from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, MAX_YAML_DEPTH, 
 
 C = TypeVar("C", bound="Configuration")
 
-
-MAX_SUGGESTIONS = 20  # names in an error, which is one line
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
 
@@ -165,20 +163,17 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _read_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
-    hints = get_type_hints(cls)
-
-    def read(entry: Any) -> ConfigurationField:
-        hint = hints[entry.name]
+@cache  # to read type hints takes longer than to check a value
+def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
+    """Return the fields of a configuration class."""
+    hints, result = get_type_hints(cls), []
+    for setting in fields(cast(Any, cls)):
+        hint = hints[setting.name]
         kind, entries = get_origin(hint) or hint, get_args(hint) or (float,)
-        return ConfigurationField(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"], entries[0])
-
-    return tuple(map(read, fields(cast(Any, cls))))
-
-
-# To read type hints takes longer than to check a value.
-configuration_fields = cast("Callable[[type[Configuration]], tuple[ConfigurationField, ...]]", cache(_read_fields))
-"""Return the fields of a configuration class."""
+        result.append(
+            ConfigurationField(cls.GROUP, setting.name, kind, setting.default, setting.metadata["quantity"], entries[0])
+        )
+    return tuple(result)
 
 
 @contextmanager
@@ -297,8 +292,7 @@ def parse_parameter_value(text: str) -> Any:
 def suggest_names(name: str, known: Sequence[str]) -> str:
     """Return known names as text, the most similar ones of many, with the closest match as a hint."""
     name = name[:MAX_NAME_CHARS]  # to compare long texts takes long
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
-    similar = difflib.get_close_matches(name, known, n=MAX_SUGGESTIONS, cutoff=0.0)
-    shown = known if len(known) <= MAX_SUGGESTIONS else [*similar, "…"]
+    similar = difflib.get_close_matches(name, known, n=20, cutoff=0.0)
+    hint = f" (did you mean {similar[0]}?)" if difflib.get_close_matches(name, similar[:1]) else ""
+    shown = known if len(known) <= 20 else [*similar, "…"]  # in one line
     return f"one of {', '.join(shown)}{hint}"
