@@ -96,8 +96,8 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
             source = None
             if options.replay is not None:
                 source = live.GraphInput(stack.enter_context(open_bag(options.replay, log, setup_name=options.setup)))
-                source.given.check_loop()
-            shown = settings(read_setup(name) if source is None else source.given.setup)
+                source.bag.check_loop()
+            shown = settings(read_setup(name) if source is None else source.bag.setup)
             shown = replace(shown, image_transport=source.transport) if source and source.transport else shown
             logs, domain = Path(stack.enter_context(TemporaryDirectory())), stack.enter_context(live.own_domain())
             page = stack.enter_context(Participant(NAME, domain=domain, simulated_clock=source is not None))
@@ -311,8 +311,8 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *live.OWN, *live.FORECAST]
-        arguments += ["-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active"]  # a person arms it
+        bridge = live.arguments_of({"coil_bridge:driver": "simulated", "coil_bridge:autostart": "active"})
+        arguments = ["--params-file", str(self.setup.path.resolve()), *live.OWN, *live.FORECAST, *bridge]  # to be armed
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
         self._nodes = NodeProcesses(processes, arguments, dict(os.environ), self._logs).__enter__()
@@ -390,18 +390,18 @@ class ReplayHost(RecordingHost):
     mode = "replay"
 
     def __init__(self, graph: ConsoleGraph, source: live.GraphInput, domain: int, logs: Path, log: Log) -> None:
-        super().__init__(graph, source.given.setup, Path(), log)
+        super().__init__(graph, source.bag.setup, Path(), log)
         self._source, self._domain = source, domain
         arguments = source.arguments(logs / "lossless.yaml")
         self._nodes = NodeProcesses(source.processes, arguments, dict(os.environ), logs)
         self._ending = threading.Event()
         self._playing: asyncio.Task[None] | None = None
-        self.busy = f"starting the nodes for {source.given.recording.path}"
+        self.busy = f"starting the nodes for {source.bag.recording.path}"
         graph.blocked = "this is a replay: nothing can be jogged or armed"
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
-        recording = self._source.given.recording
+        recording = self._source.bag.recording
         simulated = bool(recording.notes.get("simulated", ""))
         return {**super().state(), "setup": str(recording.path), "can_record": False, "simulated": simulated}
 

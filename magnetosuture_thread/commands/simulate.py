@@ -290,7 +290,7 @@ class _Run:
         setup, task = self.setup, self.task
         arguments = ["--params-file", str(setup.path.resolve()), *live.OWN, *task.arguments]
         if self.rate is not None:
-            arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self.rate)}"]
+            arguments += live.arguments_of({"use_sim_time": "true", "rig_simulator:rate": float(self.rate)})
         text, what = setup.path.read_text(encoding="utf-8"), f"the whole rig, closed loop, setup {setup.name}"
         notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
         every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *task.recorded)
@@ -298,8 +298,9 @@ class _Run:
         nodes = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
         processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
-            simulated = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
-            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else simulated
+            bridge = {"coil_bridge:driver": "simulated", "coil_bridge:autostart": "armed"}
+            bridge = _wired(ports, len(setup.coils.coil_angles)) if self.boards else bridge
+            arguments += live.arguments_of(bridge)
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
             with live.own_graph(processes, arguments, folder / "logs", nodes, self.log) as graph:
@@ -381,10 +382,10 @@ def _arm() -> None:
                 raise GraphError(f"the bridge cannot be armed: {error}") from None
 
 
-def _wired(folder: str, coils: int) -> list[str]:
-    """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
+def _wired(folder: str, coils: int) -> dict[str, str]:
+    """Return the parameters under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
-    values = {
+    return {
         "coil_bridge:driver": "roboclaw",
         "coil_bridge:autostart": "active",
         "coil_bridge:roboclaw_ports": ports,
@@ -396,7 +397,6 @@ def _wired(folder: str, coils: int) -> list[str]:
         "rig_simulator:power_stage": "roboclaw",
         "rig_simulator:power_stage_ports": ports,
     }
-    return [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
 
 
 def _wait(recorder: clients.Recorder, check: Callable[[], None], log: Log) -> None:
