@@ -131,7 +131,7 @@ def _compared(
 ) -> dict[str, Any]:
     """Return the figures of the model with n segments."""
     settings, scene = setup.model, setup.scene
-    size = {"length": settings.thread_length, "segments": segments, "viscosity": settings.viscosity}
+    size: dict[str, Any] = {"length": settings.thread_length, "segments": segments, "viscosity": settings.viscosity}
     predictor = ThreadPredictor.create(settings.material, scene=scene, **size)
     predictor.warm_up()
     assert isinstance(predictor.formulation, RodFormulation)

@@ -39,8 +39,10 @@ from magnetosuture_thread import (
 PROCEDURES = ("dead_end", "figure_eight", "hernia", "slalom", "wrap_and_tighten")
 TOLERANCE = 1e-7  # m, rad or of the value itself
 # Of the machine, and not compared.
-TIMES = ("step_time", "step_median", "step_p99", "solve_time", "wall", "speed", "seconds", "latency", "duration")
-TIMES += ("tracker",)
+TIMES = (
+    *("step_time", "step_median", "step_p99", "solve_time", "wall", "speed", "seconds", "latency", "duration"),
+    "tracker",
+)
 
 
 def _run(*arguments: object) -> None:
@@ -66,7 +68,7 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 def _save_bag(folder: Path, target: Path) -> None:
     """Save the numbers of a bag's messages by topic and field."""
-    values = defaultdict(list)
+    values = defaultdict[str, list[Any]](list)
     with AnyReader([folder]) as reader:
         for connection, stamp, data in reader.messages():
             if connection.msgtype.endswith(("Image", "CompressedImage")):

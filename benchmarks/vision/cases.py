@@ -65,7 +65,8 @@ def unit_vector(angle: float) -> Points:
 def random_lighting(random: Random) -> Lighting:
     """Return lighting and noise of a usual laboratory."""
     ranges = {"gain": (0.7, 1.05), "slope": (0.0, 3.0), "glare": (0.0, 1.0), "noise": (0.5, 2.0), "blur_px": (0.6, 1.0)}
-    return Lighting(**{name: random.uniform(*bounds) for name, bounds in ranges.items()})
+    values: dict[str, Any] = {name: random.uniform(*bounds) for name, bounds in ranges.items()}
+    return Lighting(**values)
 
 
 def random_needle(random: Random, length: float = 0.007, within: float = WITHIN, width: float = 0.0004) -> Needle:

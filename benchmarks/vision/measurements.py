@@ -172,7 +172,7 @@ def compare(case: Case, track: Track, seconds: float) -> Result:
     turned = math.atan2(track.heading[1], track.heading[0]) - case.needle.heading
     off = np.append(track.tail - case.needle.tail, (turned + math.pi) % (2.0 * math.pi) - math.pi)
     bound = max(WRONG_LINE_PX * case.working_scale, 0.5 * case.thread_px * case.view.metres_per_pixel)
-    line, lengths = published_centreline(track), dict[str, float]()
+    line, lengths = published_centreline(track), dict[str, Any]()
     if len(line) > 1:
         points, length = dense(line), float(arc_lengths(line)[-1])
         lengths = {"line": length, "wrong": length * (1.0 - _share(points, truth, bound))}

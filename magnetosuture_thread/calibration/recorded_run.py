@@ -132,7 +132,7 @@ def read_run(
         stamp, last = observation.stamp, poses[-1][0] if poses else None
         counts.update(needle=1, seen=len(observation.measured) > 1, truth=len(observation.ground_truth) > 1)
         curves = {"seen": observation.measured, "truth": observation.ground_truth}
-        targets = {which: target_points(curve, length, settings.segments) for which, curve in curves.items()}
+        nodes = {which: target_points(curve, length, settings.segments) for which, curve in curves.items()}
         if last is not None and stamp <= last:
             if stamp < last - 1_000_000_000:
                 back = (last - stamp) * 1e-9
@@ -149,8 +149,8 @@ def read_run(
         poses.append((stamp, observation.tail, observation.heading))
         # Before, the noise of the leg's first centreline has not straightened out.
         is_settled = stamp >= poses[legs[-1]][0] + round(SETTLING * 1e9)
-        if is_settled and targets[against][1] >= enough:
-            compared.append((len(poses) - 1, targets[against][0], targets["truth"][0]))
+        if is_settled and nodes[against][1] >= enough:
+            compared.append((len(poses) - 1, nodes[against][0], nodes["truth"][0]))
     legs_and_ends = zip(legs, [*legs[1:], len(poses)], strict=False)  # none without poses
     duration = 1e-9 * sum(poses[end - 1][0] - poses[leg][0] for leg, end in legs_and_ends)
     too_short = f"is too short: {duration:.1f} s with needle and thread, expected at least {MIN_DURATION:g} s"
@@ -168,9 +168,10 @@ def read_run(
         if is_there:
             raise BagError(name, problem)
     chosen = np.unique(np.linspace(0, len(compared) - 1, min(MAX_FRAMES, len(compared))).round().astype(int))
-    needle = map(np.array, zip(*poses, strict=True))
-    thread = map(np.array, zip(*(compared[index] for index in chosen), strict=True))
-    run = RecordedRun(name, *needle, tuple(legs), tuple(initials), *thread, against, simulated, scene)
+    stamps, tails, headings = map(np.array, zip(*poses, strict=True))
+    frames, targets, truths = map(np.array, zip(*(compared[index] for index in chosen), strict=True))
+    thread = tuple(legs), tuple(initials), frames, targets, truths
+    run = RecordedRun(name, stamps, tails, headings, *thread, against, simulated, scene)
     moved = _moved(run) / length
     if moved < SLOW:
         why = "nothing moves" if moved < 0.02 else "the needle is too slow"

@@ -150,7 +150,10 @@ class BagFit(NamedTuple):
         across = [mean_across(vertices, run, length) for vertices in (self.before, self.after)]
         times = (run.stamps - run.stamps[0]) * 1e-9
         silence = SensorSilence.of(times, 0.0, float(times[-1]))
-        words = {"silence": str(silence) if silence.max_gap > MAX_SILENCE else "", "simulated": run.simulated}
+        words: dict[str, Any] = {
+            "silence": str(silence) if silence.max_gap > MAX_SILENCE else "",
+            "simulated": run.simulated,
+        }
         return BagErrors(run.name, len(run.frames), *errors, *across, unverified=run.unverified, **words)
 
 

@@ -9,7 +9,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -139,10 +140,8 @@ class BagRecording:
     ) -> None:
         self.output, self._notes = output, notes
         self._inboxes = [Inbox(graph.node, topic, 1000) for topic in recorded]
-        self._begun, self._ending = asyncio.Event(), threading.Event()
-        loop = asyncio.get_running_loop()
-        writing = asyncio.to_thread(self._write, lambda: loop.call_soon_threadsafe(self._begun.set))
-        self._writing = asyncio.create_task(writing)
+        self._begun, self._ending = Future[None](), threading.Event()
+        self._writing = asyncio.create_task(asyncio.to_thread(self._write))
 
     @property
     def ended(self) -> bool:
@@ -155,9 +154,8 @@ class BagRecording:
         Raises:
             BagError: the output exists or cannot be written.
         """
-        begun = asyncio.create_task(self._begun.wait())
+        begun = asyncio.wrap_future(self._begun)
         await asyncio.wait((begun, self._writing), return_when=asyncio.FIRST_COMPLETED)
-        begun.cancel()
         if self.ended:
             await self.end()
 
@@ -174,14 +172,14 @@ class BagRecording:
         self._inboxes = []
         self._writing.result()
 
-    def _write(self, begun: Callable[[], object]) -> None:
+    def _write(self) -> None:
         with (
             whole_folder(self.output, is_recording=True) as folder,
             BagWriter(folder, self._notes, name=self.output.name) as bag,
         ):
             for inbox in self._inboxes:
                 bag.add_topic(inbox.topic.channel.recorded, inbox.topic.channel.type_name)
-            begun()
+            self._begun.set_result(None)
             ending = False
             while not ending:
                 ending = self._ending.wait(0.01)
@@ -193,8 +191,8 @@ class BagRecording:
 def new_name(folder: Path, name: str) -> Path:
     """Return a folder that does not exist yet for a recording, named by the time and the setup."""
     stem = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}".rstrip("_")
-    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
-    return next(folder / each for each in names if not (folder / each).exists())
+    endings = itertools.chain([""], (f"_{number}" for number in itertools.count(2)))
+    return next(path for ending in endings if not (path := folder / f"{stem}{ending}").exists())
 
 
 class RecordingHost(GraphHost):
@@ -226,10 +224,8 @@ class RecordingHost(GraphHost):
             operator: who commands that page.
         """
         notes = {"setup": self.setup.name, SETUP_NOTE: self.setup.path.read_text(encoding="utf-8")}
-        if self.graph.is_active(RIG):
-            what = f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
-            notes["simulated"] = what
-        return notes
+        what = f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
+        return {**notes, **({"simulated": what} if self.graph.is_active(RIG) else {})}
 
     def start(self) -> None:
         """Start what this runs; here nothing."""
@@ -270,10 +266,9 @@ class RecordingHost(GraphHost):
 
     async def _end_recording(self) -> str:
         """End the recording, if there is one; return the problem if it is not complete."""
-        recording = self._recording
+        recording, problem = self._recording, ""
         if recording is None:
             return ""
-        problem = ""
         try:
             await recording.end()
         except MagnetosutureError as error:

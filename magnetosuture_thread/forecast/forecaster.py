@@ -32,7 +32,7 @@ from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_checks import WALL_NAME
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread

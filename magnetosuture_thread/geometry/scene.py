@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc, Polygon
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 KINDS = ("tissue", "instrument", "wall")

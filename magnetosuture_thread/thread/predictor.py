@@ -16,8 +16,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_checks import find_collision
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
-from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.configuration import Quantity, bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins
