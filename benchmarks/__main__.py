@@ -12,7 +12,7 @@ from importlib import import_module
 from magnetosuture_thread.cli import exit_code
 from magnetosuture_thread.commands import command
 
-# Each is a file, with `add_options(parser)` and `run(options, console)`, which returns figures and whether they passed.
+# Each is a file with `add_options(parser)` and `run(options, terminal)`, which returns figures and whether they passed.
 BENCHMARKS = (
     *("solver", "contact", "forecast", "estimator", "vision", "bridge", "keep-out", "lies", "network", "page"),
     *("attack", "frame", "golden"),
@@ -40,7 +40,7 @@ def _run(options: argparse.Namespace) -> int:
     """Run a benchmark and write its figures; tables go to standard error where the JSON goes to standard output."""
     command.check_outputs(options)
     to_standard_output = options.json == command.STANDARD_OUTPUT
-    figures, passed = options.run(options, command.make_console(errors=to_standard_output))
+    figures, passed = options.run(options, command.Terminal(errors=to_standard_output))
     if to_standard_output:
         sys.stdout.write(json.dumps(figures, indent=2, allow_nan=False) + "\n")
     else:

@@ -20,11 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
-from rich.console import Console
 
 from benchmarks.report import figures_table
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.power import PowerStage
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import GraphError
@@ -301,15 +300,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--hostile", type=whole_number, default=10_000, metavar="N", help="hostile messages (default: 10000)")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
-    log = make_log(console)
-    with progress(console, "bridge") as advance:
+    log = terminal.log
+    with terminal.progress("bridge") as advance:
         figures = measure_bridge(options.trials, options.kills, options.hostile, log, advance)
     names = ("median", "p99", "greatest", "bound")
     columns = {"": "{event}", **{name: f"{{{name}:.1f}}" for name in names}, "beyond": "{beyond}/{count}"}
     title = "coil bridge with simulated boards, all cores busy; times in ms to zero of all duties"
-    console.print(figures_table(title, figures["delays"], columns))
+    terminal.print(figures_table(title, figures["delays"], columns))
     loop = ", ".join(f"{value:.2f}" for value in figures["loop"])
     log(f"loop at {figures['rate']:g} Hz, {figures['scheduling']}: off its period by {loop} ms (median, p99, maximum)")
     log("{hostile} hostile messages: at most {greatest_current:.2f} A of {max_current:.2f} A".format(**figures))

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from benchmarks.closed_loop import LoopRecord, PathControl
 from benchmarks.friction import measure_friction
@@ -26,7 +25,7 @@ from benchmarks.report import figures_table
 from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.commands.command import make_log
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.evaluation import hernia
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.rig.closed_loop import START, ClosedLoop
@@ -52,9 +51,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--segments", type=int, nargs="+", default=[40, 60, 80], metavar="N", help="of the model")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Measure; return the figures, and whether no chord is too deep, all steps converged and nothing passed through."""
-    log = make_log(console)
+    log = terminal.log
     smooth = read_setup("hernia_ring")
     log("the thread model steers its needle")
     needle = hernia.point_filter(smooth.scene, smooth.coils.keep_out, smooth.coils.approach_rate)
@@ -84,7 +83,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         f"1 to {CROWDED - 1} nodes pushed": "{median_step_us[1]:.0f}",
         f"{CROWDED} or more": "{median_step_us[2]:.0f}",
     }
-    console.print(figures_table(title, rows, columns))
+    terminal.print(figures_table(title, rows, columns))
     log("the loop closed: the needle moves by the coils, and the poses are noisy")
     loops = [_closed_loop(read_setup(name), segments) for name, segments in LOOPS]
     title = f"closed loop, rig of {TRUE_SEGMENTS} segments, simulated; pull in % of its peak, nodes in % of the length"
@@ -95,14 +94,14 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         "prediction, mean (maximum)": "{prediction[mean_percent]:.3f} ({prediction[max_percent]:.2f})",
         "estimate": "{estimate[mean_percent]:.3f} ({estimate[max_percent]:.2f})",
     }
-    console.print(figures_table(title, loops, columns))
+    terminal.print(figures_table(title, loops, columns))
     log("friction by itself")
     friction = measure_friction()
     columns = {"mu": "{friction:g}", "turns": "{turns:g}", "off [%]": "{error_percent:+.2f}"}
-    console.print(figures_table("capstans: T2 / T1 over exp(mu theta), less 1", friction, columns))
+    terminal.print(figures_table("capstans: T2 / T1 over exp(mu theta), less 1", friction, columns))
     log(f"a thread that touches itself: {options.motions} random motions")
     selves = measure_self_contact(options.motions)
-    console.print(self_contact_table(selves))
+    terminal.print(self_contact_table(selves))
     passed = all(row["deepest_m"] <= MAX_DEPTH and row["not_converged"] == 0 for row in rows)
     passed = passed and selves["model"]["crossed"] == selves["rig"]["crossed"] == 0
     return {"cases": rows, "closed_loop": loops, "friction": friction, "self_contact": selves}, passed

@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from benchmarks.report import figures_table
 from magnetosuture_thread.bags.reading import pose_deviation
-from magnetosuture_thread.commands.command import make_log, progress
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
@@ -465,10 +464,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--rendered", type=int, default=0, metavar="N", help="also N seeds of unknown posts, by rendered frames")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Measure the cases; return the figures, and whether all limits hold."""
     names, done, cases = options.cases or list(CASES), 0, []
-    with progress(console, "estimator") as report:
+    with terminal.progress("estimator") as report:
 
         def advance() -> None:
             nonlocal done
@@ -487,7 +486,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         "runs": "{runs}",
         "met": "{met}",
     }
-    console.print(figures_table("mean, greatest error in % of the length", cases, columns))
+    terminal.print(figures_table("mean, greatest error in % of the length", cases, columns))
     if rendered:
-        make_log(console)("rendered frames: " + ", ".join(f"{name} {value}" for name, value in rendered.items()))
+        terminal.log("rendered frames: " + ", ".join(f"{name} {value}" for name, value in rendered.items()))
     return {"cases": cases, "rendered": rendered}, all(figures["met"] for figures in cases)

@@ -18,12 +18,11 @@ import timeit
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from benchmarks.closed_loop import LoopRecord, Vector
 from benchmarks.report import figures_table
 from magnetosuture_thread import Disc, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
-from magnetosuture_thread.commands.command import make_log
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.geometry.polyline import Points
@@ -160,9 +159,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--loops", nargs="*", default=LOOPS, metavar="NAME", help=f"procedures (default: {' '.join(LOOPS)})")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Measure; return the figures."""
-    log, milliseconds = make_log(console), measure_time(options.repeats)
+    log, milliseconds = terminal.log, measure_time(options.repeats)
     log(f"one forecast of 3 s, n = 81: {milliseconds:.1f} ms")
     loops = []
     for name in options.loops:
@@ -176,5 +175,5 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         "nothing moves, mean": "{still_mean_percent:.2f}",
         "published": "{published} of {forecasts}",
     }
-    console.print(figures_table("forecasts 3 s ahead against the simulated rig, in % of the length", loops, columns))
+    terminal.print(figures_table("forecasts 3 s ahead against the simulated rig, in % of the length", loops, columns))
     return {"single_ms": milliseconds, "loops": loops}, True

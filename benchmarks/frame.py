@@ -14,9 +14,9 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from benchmarks.report import figures_table
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.geometry.polyline import lay_behind_needle
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.setups import read_setup
@@ -30,7 +30,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="show the functions with their calls")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Count one frame; return the figures, by folder and of all. There is no limit to pass."""
     calls = count_frame()
     figures: dict[str, Any] = {}
@@ -39,10 +39,10 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         sums = {"files": len({file for file, _ in inside}), "functions": len(inside), "calls": sum(inside.values())}
         figures[folder or "all"] = sums
     for (file, function), count in sorted(calls.items()) if options.list else ():
-        console.print(f"{count:6d}  {file}  {function}", soft_wrap=True)
+        terminal.print(f"{count:6d}  {file}  {function}", soft_wrap=True)
     rows = [{"folder": folder, **sums} for folder, sums in figures.items()]
     names = ("folder", "files", "functions", "calls")
-    console.print(figures_table("one frame", rows, {name: f"{{{name}}}" for name in names}))
+    terminal.print(figures_table("one frame", rows, {name: f"{{{name}}}" for name in names}))
     return figures, True
 
 

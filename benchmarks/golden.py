@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rosbags.highlevel import AnyReader
 
 from magnetosuture_thread import (
@@ -35,6 +34,7 @@ from magnetosuture_thread import (
     ThreadForecaster,
     ThreadPredictor,
 )
+from magnetosuture_thread.commands.command import Terminal
 
 PROCEDURES = ("dead_end", "figure_eight", "hernia", "slalom", "wrap_and_tighten")
 TOLERANCE = 1e-7  # m, rad or of the value itself
@@ -180,7 +180,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         compare.add_argument(name, type=Path)
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Record or compare."""
     if options.action == "record":
         for part in options.only:
@@ -191,7 +191,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     for path in sorted(p for p in options.old.rglob("*") if p.suffix in (".npz", ".json", ".txt")):
         name = path.relative_to(options.old)
         for line in _differences(path, options.new / name):
-            console.print(f"{name}: {line}", soft_wrap=True, markup=False)
+            terminal.print(f"{name}: {line}", soft_wrap=True, markup=False)
             count += 1
-    console.print(f"{count} differences")
+    terminal.print(f"{count} differences")
     return {"differences": count}, count == 0

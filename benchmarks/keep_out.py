@@ -20,13 +20,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-from rich.console import Console
 
 from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import MAX_BLIND_DISTANCE, CoilBridgeSettings
-from magnetosuture_thread.commands.command import make_log, progress
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.geometry.scene_shapes import shape_from_mapping
@@ -356,15 +355,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Attack the promise; return the figures and whether it was kept."""
-    log, total, began = make_log(console), Tally(), time.process_time()
-    with progress(console, "keep-out") as advance:
+    total, began = Tally(), time.process_time()
+    with terminal.progress("keep-out") as advance:
         while total.seconds < options.seconds:
             total.add(attack(options.seed + total.episodes))
             advance(total.seconds / options.seconds)
     deepest = None if math.isinf(total.deepest) else total.deepest  # the needle was never near; JSON has no infinity
-    log(
+    terminal.log(
         f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls, "
         f"{total.faults} faults: {total.violations} violations beyond {1e6 * TOLERANCE:g} um, "
         f"deepest {1e6 * total.deepest:.4f} um"

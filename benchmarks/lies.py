@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from benchmarks.closed_loop import PathControl
 from benchmarks.keep_out import World
 from benchmarks.report import figures_table
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.rig.campaign import vary
 from magnetosuture_thread.rig.closed_loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.rig.rig import Rig, RigFrame
@@ -169,7 +169,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Run all lies; return the figures, and whether every one but an honest tracker's ended in a fault."""
     setups, lies = options.setup or SETUPS, options.lie or LIES
     with ProcessPoolExecutor(options.workers) as pool:
@@ -183,7 +183,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     )
     for name in setups:
         rows = [_row(kind, [run for run in told if (run["setup"], run["lie"]) == (name, kind)]) for kind in lies]
-        console.print(figures_table(f"{name}: lies about the needle's pose, simulated", rows, columns, caption))
+        terminal.print(figures_table(f"{name}: lies about the needle's pose, simulated", rows, columns, caption))
     return {"runs": runs}, all((run["stopped_s"] is None) == (run["lie"] == "none") for run in told)
 
 

@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
 
 from benchmarks.hosts import TwoHosts
 from benchmarks.report import figures_table
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import GraphError
 
@@ -225,11 +224,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--impaired-cuts", type=whole_number, default=50, metavar="N", help=text)
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Pull the cable; return the figures, and whether the coils were at zero in time after each cut."""
     networks = [(0.0, 0.0, options.cuts), (DELAY, LOSS, options.impaired_cuts)]
-    with progress(console, "network") as advance:
-        reports = measure_network(networks, make_log(console), advance)
+    with terminal.progress("network") as advance:
+        reports = measure_network(networks, terminal.log, advance)
     figures = [report.to_json() for report in reports]
     columns = {
         "network": "{delay:g} s, {loss:.0%} lost",
@@ -238,7 +237,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         "goes on [s]": "{resumed_median:.3f}, {resumed_maximum:.3f}",
         "stops kept": "{stops_kept} of {stops}",
     }
-    console.print(figures_table("Two hosts, simulated rig", figures, columns))
+    terminal.print(figures_table("Two hosts, simulated rig", figures, columns))
     # No stopped bridge may go on by itself either.
     passed = all(report.late == 0 and report.stops == report.stops_kept for report in reports)
     return {"bound": COMMAND_TIMEOUT, "networks": figures}, passed

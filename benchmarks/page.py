@@ -25,10 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
-from rich.console import Console
 
 from benchmarks.report import figures_table
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.configuration import read_yaml
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
@@ -69,16 +68,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--presses", type=whole_number, default=200, metavar="N", help="of a key (default: 200)")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Time the page; return the figures."""
-    log = make_log(console)
+    log = terminal.log
     log(f"starting {SETUP} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
-    with progress(console, "page") as advance:
+    with terminal.progress("page") as advance:
         delays, rates = _measure(options.presses, advance)
     columns = {"": "{station}", **{name: f"{{{name}:.1f}}" for name in ("median", "p99", "greatest")}}
     columns |= {"keys": "{count}", "lost": "{lost}"}
     title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
-    console.print(figures_table(title, delays, columns))
+    terminal.print(figures_table(title, delays, columns))
     log(f"limit: 50 ms at the bridge, 99th percentile; {FRAME_RATE:g} pictures a second")
     log("the page drew {drawn:.1f} pictures a second, of {states:.1f} states and {frames:.1f} frames".format(**rates))
     return {"scenario": SETUP, "segments": SEGMENTS, "delays": delays, **rates}, True

@@ -23,10 +23,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from rich.console import Console
 
 from benchmarks.report import figures_table
-from magnetosuture_thread.commands.command import progress
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.geometry.obstacles import Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
@@ -266,10 +265,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--segments", type=int, nargs="+", default=[25, 40, 81, 320], metavar="N")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Time predictions, steps and solves; return the figures."""
     rows, sizes = list[dict[str, Any]](), list(product(options.segments, (False, True)))
-    with progress(console, "solver") as advance:
+    with terminal.progress("solver") as advance:
         for index, (segments, obstacles) in enumerate(sizes, 1):
             solvers: list[Solver] = [
                 BandedSolver(),
@@ -280,5 +279,5 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
             advance(index / len(sizes))
     columns = {"system": "{system}", "n": "{n}", "obst.": "{obstacles}", "median [s]": "{median_s:.3g}"}
     columns |= {"p99 [s]": "{p99_s:.3g}", "of rod step": "{of_rod_step}", "residual": "{max_residual:.1e}"}
-    console.print(figures_table("one step, one solve, processor time", rows, columns, "obst.: of 200 triangles each"))
+    terminal.print(figures_table("one step, one solve, processor time", rows, columns, "obst.: of 200 triangles each"))
     return {"rows": rows}, True

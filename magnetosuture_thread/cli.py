@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
-from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe, make_console
+from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe
 from magnetosuture_thread.settings.errors import missing_module
 
 DESCRIPTION = """\
@@ -93,7 +93,7 @@ def exit_code(run: Callable[[], int]) -> int:
 
 
 def _fail(problem: str, code: int) -> int:
-    errors = make_console(errors=True)
+    errors = Terminal(errors=True)
     errors.print("error:", style="bold red", end=" ")
     errors.print(" ".join(problem.split()), markup=False)
     return code

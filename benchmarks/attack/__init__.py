@@ -15,9 +15,7 @@ import argparse
 import random
 from typing import Any
 
-from rich.console import Console
-
-from magnetosuture_thread.commands.command import count_argument, make_log, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, count_argument, whole_number
 
 TARGETS = ("bags", "nodes")
 MAX_LINES = 20  # on broken promises that are shown; `--json` writes all
@@ -31,9 +29,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole_number, default=1, metavar="S", help="of the variation (default: 1)")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Attack; return the figures and whether all promises were kept."""
-    with progress(console, f"attack {options.target}") as advance:
+    with terminal.progress(f"attack {options.target}") as advance:
         if options.target == "bags":
             from benchmarks.attack.bags import attack_bags
 
@@ -48,6 +46,6 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
                     attack.attack(number, random.Random(f"{options.seed} {clock}"), clock)
             figures, lines = attack.figures()
     for line in (*lines, *figures["broken"][:MAX_LINES]):
-        make_log(console)(line)
+        terminal.log(line)
     chosen = {"target": options.target, "count": options.count, "seed": options.seed}
     return {**chosen, **figures}, not figures["broken"]

@@ -11,12 +11,11 @@ from dataclasses import asdict
 from typing import Any
 
 import cv2
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.measurements import frame_of, measure, row_of
-from magnetosuture_thread.commands.command import count_argument, make_log, make_table, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, count_argument, make_table, whole_number
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.vision.tracker import warm_up
 
@@ -36,7 +35,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--save", nargs=3, metavar=("CLASS", "INDEX", "FILE"), help=save)
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Measure; return the figures and whether no pose was reversed."""
     if options.save:
         name, index, file = options.save
@@ -46,16 +45,16 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
     warm_up()
     rows = []
-    with progress(console, "vision") as advance:
+    with terminal.progress("vision") as advance:
         for number, name in enumerate(names, 1):
             frames = (frame_of(name, index, options.seed) for index in range(options.count))
             rows.append(asdict(row_of(name, [measure(*frame) for frame in frames])))
             advance(number / len(names))
     title = f"on rendered frames, {options.count} of each class"
-    console.print(_table(f"the needle {title}", NEEDLE, rows, POSES))
-    console.print(_table(f"the thread {title}", THREAD, rows, PIECES))
+    terminal.print(_table(f"the needle {title}", NEEDLE, rows, POSES))
+    terminal.print(_table(f"the thread {title}", THREAD, rows, PIECES))
     total = {name: sum(row[name] for row in rows) for name in TOTALS}
-    make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
+    terminal.log(", ".join(f"{value} {name}" for name, value in total.items()))
     return {"count": options.count, "seed": options.seed, "rows": rows, "total": total}, total["reversed"] == 0
 
 

@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -229,40 +228,31 @@ class _PlainConsole(Console):
             yield segment if control or text.isprintable() else Segment(printable(text), style)
 
 
-def make_console(*, errors: bool = False) -> Console:
-    """Return the console of a command: numbers and paths in no colours of their own, control characters escaped.
-
-    Args:
-        errors: whether it writes to standard error, in place of standard output.
-    """
-    return _PlainConsole(highlight=False, emoji=False, stderr=errors, soft_wrap=errors)
-
-
-def make_log(console: Console) -> Callable[[str], None]:
-    """Return what prints a line as it is, however long."""
-    return lambda text: console.print(text, soft_wrap=True, markup=False)
-
-
-@contextmanager
-def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
-
-
 class Terminal:
     """What a command shows while it runs and when it is done.
 
+    Args:
+        errors: whether it writes to standard error, in place of standard output.
+
     Attributes:
-        log: called with a line for a person, which is printed as it is, however long.
         print: called with a table.
-        progress: shows a progress bar of a name; see `progress`.
     """
 
-    def __init__(self) -> None:
-        console = make_console()
-        self.log, self.print, self.progress = make_log(console), console.print, partial(progress, console)
+    def __init__(self, *, errors: bool = False) -> None:
+        # Numbers and paths have no colours of their own.
+        self._console = _PlainConsole(highlight=False, emoji=False, stderr=errors, soft_wrap=errors)
+        self.print = self._console.print
+
+    def log(self, text: str) -> None:
+        """Print a line for a person as it is, however long."""
+        self._console.print(text, soft_wrap=True, markup=False)
+
+    @contextmanager
+    def progress(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
+        with Progress(console=self._console, transient=True) as bar:
+            task = bar.add_task(name, total=1.0)
+            yield lambda share: bar.update(task, completed=share)
 
 
 def make_table(
