@@ -37,7 +37,8 @@ from magnetosuture_thread.vision.tracker import TrackerSession
 LENGTH, WALL_RADIUS, POST_RADIUS = 0.019, 0.0175, 1.2e-3  # m; of thread, dish and post
 SEGMENTS = 25  # of the model
 RATE, DURATION = 30.0, 25.0  # frames a second, and s
-SPACING = 1.6e-4  # m; of the points along the thread, about two pixels
+SPACING, DEVIATION = 1.6e-4, 2e-5  # m; of points along the thread, two pixels, and across it, a quarter
+HIDDEN_TIME = (10.0, 15.0)  # s; from when to when a part is covered
 FOUND_TIME, CONSISTENCY_WINDOW = 0.5, 5.0  # s; in which an unknown contact is to be found
 THREADS = (("polyamide_7_0", "pinned"), ("polyamide_7_0", "clamped"), ("silk_6_0", "pinned"))
 
@@ -137,67 +138,6 @@ def simulate(
 
 
 @dataclass(frozen=True)
-class CameraModel:
-    """What the camera does to the thread.
-
-    Attributes:
-        deviation: of the points across the thread [m].
-        outliers: part of the points that lie 5 mm away.
-        scale: factor on all lengths about the dish's middle.
-        hidden: arc lengths between which the thread is covered [m].
-        hidden_time: from when to when [s].
-    """
-
-    deviation: float = 2e-5  # a quarter of a pixel
-    outliers: float = 0.0
-    scale: float = 1.0
-    hidden: tuple[float, float] = (0.0, 0.0)
-    hidden_time: tuple[float, float] = (10.0, 15.0)
-
-    def observe(
-        self, nodes: Points, time: float, rng: np.random.Generator, others: tuple[Points, ...] = ()
-    ) -> ThreadObservation:
-        """Return what is seen of a thread, and of other threads in the dish.
-
-        Args:
-            nodes: of the thread [m].
-            time: [s]
-            rng: of the noise.
-            others: polylines [m].
-        """
-        length = float(arc_lengths(nodes)[-1])
-        stretches, (low, high) = [(0.0, length)], self.hidden
-        if high > low and self.hidden_time[0] <= time < self.hidden_time[1]:
-            stretches = [(a, b) for a, b in ((0.0, low), (high, length)) if b - a > 4.0 * SPACING]
-        pieces = [self._piece(nodes, a, b, length, rng) for a, b in stretches]
-        for other in others:
-            points = points_at(other, np.arange(0.0, float(arc_lengths(other)[-1]), SPACING))
-            noisy = points + rng.normal(0.0, self.deviation, points.shape)
-            ends = PieceEnd.UNKNOWN, PieceEnd.UNKNOWN
-            pieces.append(ThreadPiece(noisy, np.full(len(noisy), self.deviation), *ends, (np.nan, np.nan), False))
-        return ThreadObservation(tuple(pieces), complete=stretches == [(0.0, length)])
-
-    def _piece(self, nodes: Points, begin: float, end: float, length: float, rng: np.random.Generator) -> ThreadPiece:
-        at = np.linspace(begin, end, max(int((end - begin) / SPACING), 2) + 1)
-        points = points_at(nodes, at)
-        along = np.gradient(points, axis=0)
-        normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.hypot(*along.T)[:, None]
-        # Errors that are alike over a length: an Ornstein-Uhlenbeck process along the thread.
-        keep = float(np.exp(-2.0 * SPACING / 2.5e-4))  # m; over which neighbours err alike
-        error = rng.normal(0.0, self.deviation, len(points))
-        for k in range(1, len(points)):
-            error[k] = keep * error[k - 1] + (1.0 - keep * keep) ** 0.5 * error[k]
-        noisy = points + error[:, None] * normal
-        wrong, angle = rng.random(len(points)) < self.outliers, rng.uniform(0.0, 2.0 * np.pi, len(points))
-        noisy += wrong[:, None] * 5e-3 * np.column_stack([np.cos(angle), np.sin(angle)])
-        first = PieceEnd.TAIL if begin == 0.0 else PieceEnd.COVERED
-        last = PieceEnd.FREE if end == length else PieceEnd.COVERED
-        # What is known of the arc length: of the piece at the needle all, of one at the free end what is left.
-        known = (0.0, 0.0) if begin == 0.0 else (0.98 * begin, min(1.02 * begin, length))
-        return ThreadPiece(noisy * self.scale, np.full(len(noisy), self.deviation), first, last, known)
-
-
-@dataclass(frozen=True)
 class Case:
     """What the model is told, what is true, and what the camera gives.
 
@@ -205,7 +145,9 @@ class Case:
         name: of the case.
         limits: of the mean and the greatest error, in % of the length.
         truth: what of thread and liquid is not as told; see `simulate`.
-        camera: what is seen.
+        outliers: part of the points that the camera puts 5 mm away.
+        scale: factor of the camera on all lengths about the dish's middle.
+        hidden: arc lengths between which the thread is covered for a while [m].
         post: whether a post stands in the thread's way; `known` or `unknown` to the model, or empty.
         every: frames a pose, 1 for each.
         lost: part of the frames that never come.
@@ -218,7 +160,9 @@ class Case:
     name: str
     limits: tuple[float, float] = (0.3, 1.5)
     truth: dict[str, Any] = field(default_factory=dict)
-    camera: CameraModel = field(default_factory=CameraModel)
+    outliers: float = 0.0
+    scale: float = 1.0
+    hidden: tuple[float, float] = (0.0, 0.0)
     post: str = ""
     every: int = 1
     lost: float = 0.0
@@ -229,9 +173,7 @@ class Case:
 
 
 STIFFER, SOFTER = {"stiffness": 5.0}, {"stiffness": 0.2}
-FIRST, MIDDLE, LAST = (
-    CameraModel(hidden=(begin * LENGTH, end * LENGTH)) for begin, end in ((0.0, 0.5), (0.25, 0.75), (0.5, 1.0))
-)
+FIRST, MIDDLE, LAST = (0.0, 0.5 * LENGTH), (0.25 * LENGTH, 0.75 * LENGTH), (0.5 * LENGTH, LENGTH)
 CASES = {
     case.name: case
     for case in (
@@ -242,20 +184,20 @@ CASES = {
         Case("viscosity x 2", truth={"viscosity": 2.0}),
         Case("viscosity / 2", truth={"viscosity": 0.5}),
         Case("flow 1 mm/s", truth={"flow": (1e-3, 0.0)}),
-        Case("camera scale + 1 %", camera=CameraModel(scale=1.01)),
+        Case("camera scale + 1 %", scale=1.01),
         Case("starts straight", start="straight"),
         Case("starts wrong by 20 %", start="bent"),
-        Case("first half hidden", camera=FIRST),
-        Case("middle hidden", camera=MIDDLE),
-        Case("last half hidden", camera=LAST),
-        Case("middle, stiffness x 5", (2.0, 6.0), STIFFER, MIDDLE),
-        Case("last half, stiffness x 5", (2.0, 6.0), STIFFER, LAST),
-        Case("last half, stiffness / 5", (2.0, 6.0), SOFTER, LAST),
+        Case("first half hidden", hidden=FIRST),
+        Case("middle hidden", hidden=MIDDLE),
+        Case("last half hidden", hidden=LAST),
+        Case("middle, stiffness x 5", (2.0, 6.0), STIFFER, hidden=MIDDLE),
+        Case("last half, stiffness x 5", (2.0, 6.0), STIFFER, hidden=LAST),
+        Case("last half, stiffness / 5", (2.0, 6.0), SOFTER, hidden=LAST),
         Case("5 frames a second", every=6),
         Case("30 % lost", lost=0.3),
         Case("latency 0.2 s", latency=6),
         Case("all three", every=6, lost=0.3, latency=6),
-        Case("10 % outliers", camera=CameraModel(outliers=0.1)),
+        Case("10 % outliers", outliers=0.1),
         Case("second thread", second=True),
         Case("unknown post", (0.5, 2.0), post="unknown"),
     )
@@ -312,17 +254,46 @@ def estimator_of(run: Run, case: Case) -> ThreadEstimator:
 
 def observations(case: Case, run: Run, seed: int) -> list[ThreadObservation | None]:
     """Return what each frame shows; None for a frame that never comes."""
-    rng, seen = np.random.default_rng(seed), []
+    rng, seen = np.random.default_rng(seed), list[ThreadObservation | None]()
     # Another thread lies across the dish, waving slowly.
     angle = float(np.random.default_rng(seed).uniform(0.0, math.pi))
     turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
     along = np.linspace(-0.009, 0.009, 60)
     for index, (pose, nodes) in enumerate(zip(run.poses, run.threads, strict=True)):
-        other = np.column_stack([along, 2e-3 * np.sin(400.0 * along + 0.3 * pose.stamp)]) @ turn
-        observation = case.camera.observe(nodes, pose.stamp, rng, (other,) if case.second else ())
+        length, (low, high) = float(arc_lengths(nodes)[-1]), case.hidden
+        stretches = [(0.0, length)]
+        if high > low and HIDDEN_TIME[0] <= pose.stamp < HIDDEN_TIME[1]:
+            stretches = [(a, b) for a, b in ((0.0, low), (high, length)) if b - a > 4.0 * SPACING]
+        pieces = [_piece(case, nodes, a, b, length, rng) for a, b in stretches]
+        if case.second:
+            other = np.column_stack([along, 2e-3 * np.sin(400.0 * along + 0.3 * pose.stamp)]) @ turn
+            points = points_at(other, np.arange(0.0, float(arc_lengths(other)[-1]), SPACING))
+            noisy, ends = points + rng.normal(0.0, DEVIATION, points.shape), (PieceEnd.UNKNOWN, PieceEnd.UNKNOWN)
+            pieces.append(ThreadPiece(noisy, np.full(len(noisy), DEVIATION), *ends, (np.nan, np.nan), False))
         lost = rng.random() < case.lost and index > 0
+        observation = ThreadObservation(tuple(pieces), complete=stretches == [(0.0, length)])
         seen.append(observation if index % case.every == 0 and not lost else None)
     return seen
+
+
+def _piece(case: Case, nodes: Points, begin: float, end: float, length: float, rng: np.random.Generator) -> ThreadPiece:
+    at = np.linspace(begin, end, max(int((end - begin) / SPACING), 2) + 1)
+    points = points_at(nodes, at)
+    along = np.gradient(points, axis=0)
+    normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.hypot(*along.T)[:, None]
+    # Errors that are alike over a length: an Ornstein-Uhlenbeck process along the thread.
+    keep = float(np.exp(-2.0 * SPACING / 2.5e-4))  # m; over which neighbours err alike
+    error = rng.normal(0.0, DEVIATION, len(points))
+    for k in range(1, len(points)):
+        error[k] = keep * error[k - 1] + (1.0 - keep * keep) ** 0.5 * error[k]
+    noisy = points + error[:, None] * normal
+    wrong, angle = rng.random(len(points)) < case.outliers, rng.uniform(0.0, 2.0 * np.pi, len(points))
+    noisy += wrong[:, None] * 5e-3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    first = PieceEnd.TAIL if begin == 0.0 else PieceEnd.COVERED
+    last = PieceEnd.FREE if end == length else PieceEnd.COVERED
+    # What is known of the arc length: of the piece at the needle all, of one at the free end what is left.
+    known = (0.0, 0.0) if begin == 0.0 else (0.98 * begin, min(1.02 * begin, length))
+    return ThreadPiece(noisy * case.scale, np.full(len(noisy), DEVIATION), first, last, known)
 
 
 def play(
@@ -330,7 +301,7 @@ def play(
 ) -> tuple[list[ThreadEstimate], list[ThreadEstimate]]:
     """Return estimates at each pose but the first, as known when it comes, and at the stamps of the observations."""
     session, current, measured = EstimatorSession(estimator), list[ThreadEstimate](), list[ThreadEstimate]()
-    poses = [replace(pose, tail=pose.tail * case.camera.scale) for pose in run.poses]
+    poses = [replace(pose, tail=pose.tail * case.scale) for pose in run.poses]
     for index, pose in enumerate(poses):
         late = seen[index - case.latency] if index >= case.latency else None
         observed = late if case.start == "measured" or index > 0 else None
@@ -380,9 +351,9 @@ def measure_case(case: Case, count: int, seed: int, advance: Callable[[], None])
             estimator.predictor.start_at(run.poses[0], truth[0])
             predicted = [estimator.predictor.step(pose).positions for pose in run.poses[1:]]
             frames, nodes = slice(int(RATE), None), slice(1, None)
-            if case.camera.hidden[1] > 0.0:
-                low, high = (round(bound / LENGTH * SEGMENTS) for bound in case.camera.hidden)
-                frames = slice(*(round(bound * RATE) - 1 for bound in case.camera.hidden_time))
+            if case.hidden[1] > 0.0:
+                low, high = (round(bound / LENGTH * SEGMENTS) for bound in case.hidden)
+                frames = slice(*(round(bound * RATE) - 1 for bound in HIDDEN_TIME))
                 nodes = slice(max(low, 1), high + 1)
             elif case.post == "unknown":
                 frames = slice(min(contact, len(truth) - 2), None)
