@@ -26,12 +26,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name in BENCHMARKS:
         module = import_module(f"benchmarks.{name.replace('-', '_')}")
         description = inspect.getdoc(module) or ""
-        own = names.add_parser(name, help=description.splitlines()[0])
-        command.describe(own, description)
-        module.add_options(own)
+        subparser = names.add_parser(name, help=description.splitlines()[0])
+        command.describe(subparser, description)
+        module.add_options(subparser)
         help_json = "write the figures to a file (-: to standard output)"
-        own.add_argument("--json", type=command.output_file, metavar="FILE", help=help_json)
-        own.set_defaults(run=module.run)
+        subparser.add_argument("--json", type=command.output_file, metavar="FILE", help=help_json)
+        subparser.set_defaults(run=module.run)
     options = parser.parse_args(arguments)
     return exit_code(lambda: _run(options))
 

@@ -18,7 +18,8 @@ import struct
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 
 from magnetosuture_thread.settings.errors import GraphError
@@ -28,72 +29,53 @@ _CLONE_NEWNET, _TUNSETIFF, _TUNSETCARRIER, _IFF_TAP_NO_PI = 0x40000000, 0x400454
 _OWN_SHARED_MEMORY = 'mount -t tmpfs tmpfs /dev/shm && exec "$0" "$@"'
 
 
-class TwoHosts:
-    """The rig's host, which this process joins, and the desk's, with a cable between them.
+@contextmanager
+def two_hosts() -> Iterator[tuple[Callable[[str], None], tuple[str, ...]]]:
+    """Make the rig's host, which this process joins, and the desk's, with a cable between them.
 
     It is meant for the main thread of a process of its own: threads that run already stay where they are.
 
-    Attributes:
-        at_the_desk: what a command begins with that is to run on the desk's host.
+    Yields:
+        What executes a command of the cable, and what a command begins with that is to run on the desk's host. The
+        cable is pulled at the desk, whose host sees that; the rig's sees nothing but silence.
 
     Raises:
         GraphError: this process may not make namespaces, or a command for that is missing.
     """
-
-    def __init__(self) -> None:
-        self._hosts = [f"{name}_{os.getpid()}" for name in ("rig", "desk")]
-        enter = ("nsenter", f"--net=/run/netns/{self._hosts[1]}", "unshare", "--mount")
-        self.at_the_desk = (*enter, "sh", "-c", _OWN_SHARED_MEMORY)
-        self._network = os.open("/proc/self/ns/net", os.O_RDONLY)
-        self._cable: subprocess.Popen[str] | None = None
-
-    def __enter__(self) -> TwoHosts:
-        """Make the hosts and the cable, and join the rig's host."""
-        missing = [name for name in ("ip", "nsenter", "unshare", "mount") if shutil.which(name) is None]
-        if missing:
-            raise GraphError(f"{', '.join(missing)}: not found; install iproute2 and util-linux")
-        devices = [f"{host}_{os.getpid() % 100_000}" for host in ("r", "d")]
+    missing = [name for name in ("ip", "nsenter", "unshare", "mount") if shutil.which(name) is None]
+    if missing:
+        raise GraphError(f"{', '.join(missing)}: not found; install iproute2 and util-linux")
+    hosts = [f"{name}_{os.getpid()}" for name in ("rig", "desk")]
+    devices = [f"{host}_{os.getpid() % 100_000}" for host in ("r", "d")]
+    network = os.open("/proc/self/ns/net", os.O_RDONLY)
+    with ExitStack() as stack:
+        for host in hosts:
+            stack.callback(subprocess.run, ("ip", "netns", "delete", host), capture_output=True, check=False)
         command = [sys.executable, "-m", "benchmarks.hosts", *devices]
-        try:
-            self._cable = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-            if self._cable.stdout is None or self._cable.stdout.readline() != "ready\n":
-                raise GraphError("no TAP device can be made; that takes root's rights and /dev/net/tun")
-            for number, (host, device) in enumerate(zip(self._hosts, devices, strict=True), 1):
-                _run("ip", "netns", "add", host)
-                _run("ip", "link", "set", device, "netns", host, "name", "eth0")
-                for name in ("lo", "eth0"):
-                    _run("ip", "-n", host, "link", "set", name, "up")
-                _run("ip", "-n", host, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
-                _run("ip", "-n", host, "route", "add", "default", "dev", "eth0")
-            _join(f"/run/netns/{self._hosts[0]}")
-        except BaseException:
-            self._remove()
-            raise
-        return self
+        cable = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        stack.callback(cable.communicate)  # its devices end with it
+        assert cable.stdin is not None
+        assert cable.stdout is not None
+        commands, answers = cable.stdin, cable.stdout
+        if answers.readline() != "ready\n":
+            raise GraphError("no TAP device can be made; that takes root's rights and /dev/net/tun")
+        for number, (host, device) in enumerate(zip(hosts, devices, strict=True), 1):
+            _run("ip", "netns", "add", host)
+            _run("ip", "link", "set", device, "netns", host, "name", "eth0")
+            for name in ("lo", "eth0"):
+                _run("ip", "-n", host, "link", "set", name, "up")
+            _run("ip", "-n", host, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
+            _run("ip", "-n", host, "route", "add", "default", "dev", "eth0")
 
-    def __exit__(self, *_: object) -> None:
-        """Join the machine's own network again, and remove the hosts."""
-        _join(f"/proc/self/fd/{self._network}")
-        self._remove()
+        def execute(command: str) -> None:
+            commands.write(f"{command}\n")
+            commands.flush()
+            answers.readline()
 
-    def execute(self, command: str) -> None:
-        """Pull the cable at the desk, whose host sees that (the rig's sees nothing but silence), plug or impair it.
-
-        Args:
-            command: `pull`, `plug`, or `impair DELAY LOSS` [s, share of packets].
-        """
-        assert self._cable is not None
-        assert self._cable.stdin is not None
-        assert self._cable.stdout is not None
-        self._cable.stdin.write(f"{command}\n")
-        self._cable.stdin.flush()
-        self._cable.stdout.readline()
-
-    def _remove(self) -> None:
-        if self._cable is not None:
-            self._cable.communicate()  # its devices end with it
-        for host in self._hosts:
-            subprocess.run(("ip", "netns", "delete", host), capture_output=True, check=False)
+        _join(f"/run/netns/{hosts[0]}")
+        stack.callback(_join, f"/proc/self/fd/{network}")
+        enter = ("nsenter", f"--net=/run/netns/{hosts[1]}", "unshare", "--mount")
+        yield execute, (*enter, "sh", "-c", _OWN_SHARED_MEMORY)
 
 
 def _run(*command: str) -> None:

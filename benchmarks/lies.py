@@ -174,17 +174,17 @@ def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any]
     setups, lies = options.setup or SETUPS, options.lie or LIES
     with ProcessPoolExecutor(options.workers) as pool:
         runs = list(pool.map(run_lie, product(setups, lies, range(options.seeds))))
-    told = [run for run in runs if not run["stopped_before"]]
+    lied = [run for run in runs if not run["stopped_before"]]
     columns = {"lie": "{lie}", "latched": "{latched}/{runs}", "after [s]": "{after}", "travel [mm]": "{travel}"}
     columns |= {"speed": "{speed:.2f}", "broken": "{broken}"}
     caption = (
         "s, mm: until the fault is latched, time and true travel, median (maximum); broken: keep_out, by lies that "
-        f"began {1e3 * CLEAR:g} mm from a shape; {len(runs) - len(told)} of {len(runs)} runs stopped before their lie"
+        f"began {1e3 * CLEAR:g} mm from a shape; {len(runs) - len(lied)} of {len(runs)} runs stopped before their lie"
     )
     for name in setups:
-        rows = [_row(kind, [run for run in told if (run["setup"], run["lie"]) == (name, kind)]) for kind in lies]
+        rows = [_row(kind, [run for run in lied if (run["setup"], run["lie"]) == (name, kind)]) for kind in lies]
         terminal.print(figures_table(f"{name}: lies about the needle's pose, simulated", rows, columns, caption))
-    return {"runs": runs}, all((run["stopped_s"] is None) == (run["lie"] == "none") for run in told)
+    return {"runs": runs}, all((run["stopped_s"] is None) == (run["lie"] == "none") for run in lied)
 
 
 def _row(kind: str, runs: list[dict[str, Any]]) -> dict[str, Any]:

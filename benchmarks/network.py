@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.hosts import TwoHosts
+from benchmarks.hosts import two_hosts
 from benchmarks.report import figures_table
 from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.setups import read_setup
@@ -88,7 +88,7 @@ class CableBench:
     """The graph over two hosts, the cable between them, and what the bridge gives to the simulated rig.
 
     Args:
-        hosts: the rig's and the desk's.
+        execute: executes a command of the cable.
         processes: none of which may end.
 
     Attributes:
@@ -100,11 +100,11 @@ class CableBench:
         close: leaves the graph.
     """
 
-    def __init__(self, hosts: TwoHosts, processes: Sequence[NodeProcesses]) -> None:
+    def __init__(self, execute: Callable[[str], None], processes: Sequence[NodeProcesses]) -> None:
         from magnetosuture_thread.nodes import topics
         from magnetosuture_thread.nodes.clients import Recorder
 
-        self._hosts, self._processes, self._random = hosts, processes, random.Random(1)
+        self._execute, self._processes, self._random = execute, processes, random.Random(1)
         self._state, self._currents = topics.BRIDGE_STATE, topics.RIG_CURRENTS
         taken = [self._currents, self._state]
         recorder = Recorder(DOMAIN, taken, simulated_clock=False, receive=self._receive)
@@ -114,25 +114,25 @@ class CableBench:
 
     def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
         """Pull the cable at random moments."""
-        self._hosts.execute(f"impair {report.delay} {report.loss}")
+        self._execute(f"impair {report.delay} {report.loss}")
         self._wait(self._is_driven, "the coils are not driven", START_TIMEOUT)
         for number in range(cuts):
             self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
             progress((number + 1) / cuts)
-        self._hosts.execute("impair 0 0")
+        self._execute("impair 0 0")
 
     def _cut(self, report: CutReport, stops: bool) -> None:
         self._wait(self._is_driven, "the coils are not driven")
         self.spin(self._random.uniform(0.0, 1.0))
         self._wait(lambda: time.time() - self.driven < 0.1, "the coils are not driven")
-        self._hosts.execute("pull")
+        self._execute("pull")
         pulled = time.time()
         self.spin(self._random.uniform(0.3, 4.0))
         if stops:
             _press("stop")
         report.zero.append(max(0.0, self.driven - pulled))
         report.late += report.zero[-1] > COMMAND_TIMEOUT
-        self._hosts.execute("plug")
+        self._execute("plug")
         plugged, before = time.time(), self.driven
         if stops:
             self.spin(2.0)  # s for which it must stay at zero
@@ -183,7 +183,7 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
         GraphError: the hosts cannot be made, a node ended, or the coils are not driven.
     """
     setup, reports = read_setup(SETUP), list[CutReport]()
-    with TwoHosts() as hosts, tempfile.TemporaryDirectory() as folder:
+    with two_hosts() as (execute, desk_prefix), tempfile.TemporaryDirectory() as folder:
         # Imported here: threads that it starts have to be on the rig's host.
         from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment
 
@@ -194,8 +194,8 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
         at_the_desk = [*shared, *_parameters({"path_follower:waypoints": f"[{path}]", "console:port": "0"})]
         log("starting the nodes at the rig and at the desk")
         rig = NodeProcesses(AT_THE_RIG, at_the_rig, environment, Path(folder, "rig"))
-        desk = NodeProcesses(AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=hosts.at_the_desk)
-        with environment_of(environment), rig, desk, closing(CableBench(hosts, (rig, desk))) as bench:
+        desk = NodeProcesses(AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=desk_prefix)
+        with environment_of(environment), rig, desk, closing(CableBench(execute, (rig, desk))) as bench:
             for delay, loss, cuts in filter(lambda network: network[2], networks):
                 log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")
                 reports.append(CutReport(delay, loss))

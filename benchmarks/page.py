@@ -128,8 +128,8 @@ class RunningConsole:
         """
         deadline = time.monotonic() + TIMEOUT
         while time.monotonic() < deadline and self.process.poll() is None:
-            if found := re.search(pattern, self.output.read_text(), re.MULTILINE):
-                return found[1]
+            if match := re.search(pattern, self.output.read_text(), re.MULTILINE):
+                return match[1]
             time.sleep(0.02)
         raise GraphError(f"the console ended, or shows no {pattern} after {TIMEOUT:g} s: {self.output.read_text()}")
 
@@ -147,10 +147,10 @@ class RunningConsole:
 def running_console(*arguments: str, **environment: str) -> Iterator[RunningConsole]:
     """Run the command on a free port; end it at the end if it has not."""
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
-    own = {**os.environ, **environment}
+    env = {**os.environ, **environment}
     with TemporaryDirectory() as folder, Path(folder, "output").open("wb") as file:
         # In a session of its own: Ctrl-C at a terminal is not for it.
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=own, start_new_session=True)
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=env, start_new_session=True)
         console = RunningConsole(process, Path(file.name))
         try:
             yield console

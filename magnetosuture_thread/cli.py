@@ -54,22 +54,22 @@ def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentPa
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, summary in COMMANDS.items():
-        own = subparsers.add_parser(name, help=summary)
+        subparser = subparsers.add_parser(name, help=summary)
         if name in names:
             verb, _, kind = name.partition("-")
             module = import_module(f"magnetosuture_thread.commands.{verb}")
-            getattr(module, f"add_{kind}" if kind else "add")(own)
+            getattr(module, f"add_{kind}" if kind else "add")(subparser)
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
 
     def run() -> int:
         # A command draws into files. What a notebook asks of its own kernel may not be importable here.
         os.environ["MPLBACKEND"] = "agg"
-        options = make_parser(given[:1]).parse_args(given)
+        options = make_parser(words[:1]).parse_args(words)
         check_outputs(options)
         return int(options.run(options, Terminal()))
 

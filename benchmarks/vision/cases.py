@@ -259,7 +259,7 @@ def _below(
     axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
     keep = np.vstack([axis, case.thread[:20]])
     if all(depth_inside(outline, keep) < -CLEARANCE for outline in outlines):
-        covers = tuple(Cover(*each, blur_px) for each in zip(outlines, colours, strict=True))
+        covers = tuple(Cover(*cover, blur_px) for cover in zip(outlines, colours, strict=True))
         return replace(case, hidden_by=covers)
     return None
 

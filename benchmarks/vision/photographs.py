@@ -192,19 +192,19 @@ PHOTOGRAPHS: dict[str, Callable[[np.random.Generator], Photograph]] = {
 }
 
 
-def straightened(found: FoundDish, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def straightened(dish: FoundDish, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points of a photograph where they are once the tilt that was found is taken out, shape (m, 2) [px]."""
-    if found.tilt is None:
+    if dish.tilt is None:
         return points
-    along = np.array([math.cos(found.tilt.direction), math.sin(found.tilt.direction)])
-    offset = points - np.array(found.view.centre_px)
-    return np.asarray(points + (1.0 / math.cos(found.tilt.angle) - 1.0) * np.outer(offset @ along, along))
+    along = np.array([math.cos(dish.tilt.direction), math.sin(dish.tilt.direction)])
+    offset = points - np.array(dish.view.centre_px)
+    return np.asarray(points + (1.0 / math.cos(dish.tilt.angle) - 1.0) * np.outer(offset @ along, along))
 
 
-def ellipse_error(found: FoundDish, diameter: float, points: NDArray[np.float64]) -> float:
+def ellipse_error(dish: FoundDish, diameter: float, points: NDArray[np.float64]) -> float:
     """Return the mean distance of points from the ellipse that was found, in its radii."""
-    radius = 0.5 * diameter / found.view.metres_per_pixel
-    offset = straightened(found, points) - np.array(found.view.centre_px)
+    radius = 0.5 * diameter / dish.view.metres_per_pixel
+    offset = straightened(dish, points) - np.array(dish.view.centre_px)
     return float(np.mean(np.abs(np.hypot(*offset.T) / radius - 1.0)))
 
 

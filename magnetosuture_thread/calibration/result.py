@@ -228,7 +228,7 @@ def to_yaml(calibration: CalibrationResult) -> str:
     if settings.formulation == "rod":
         lines += _attachment(calibration)
     for name in dict.fromkeys(estimate.setting for estimate in calibration.estimates):
-        lines += _setting(name, [each for each in calibration.estimates if each.setting == name], settings)
+        lines += _setting(name, [entry for entry in calibration.estimates if entry.setting == name], settings)
     return "\n".join(lines) + "\n"
 
 
@@ -268,7 +268,7 @@ def _comment(text: str, indent: str = "") -> list[str]:
 def _entry(name: str, value: Any, note: str = "") -> str:
     """Return a line of the section: a float has its point, as ROS and any YAML reader take it, and six digits."""
     if isinstance(value, tuple):
-        value = [float(f"{each:.6g}") for each in value]
+        value = [float(f"{estimate:.6g}") for estimate in value]
     elif isinstance(value, float):
         value = float(f"{value:.6g}")
     text = yaml.safe_dump({name: value}, default_flow_style=None if isinstance(value, list) else False).strip()

@@ -81,22 +81,22 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
                 result.died[seed] = str(outcome)
                 terminal.log(f"seed {seed}: {outcome}")
                 continue
-            made, used_time = outcome
-            result.runs.append(made)
-            speed = made.simulated_s / used_time
-            terminal.log(f"seed {seed}: {made.reason or 'success'} ({speed:.1f} times real time)")
-        result.runs.sort(key=lambda made: made.seed)
-        rows = [each.to_json() for each in result.runs]
+            seed_run, used_time = outcome
+            result.runs.append(seed_run)
+            speed = seed_run.simulated_s / used_time
+            terminal.log(f"seed {seed}: {seed_run.reason or 'success'} ({speed:.1f} times real time)")
+        result.runs.sort(key=lambda seed_run: seed_run.seed)
+        rows = [seed_run.to_json() for seed_run in result.runs]
         for ending in ("json", "csv"):
             write_table(folder / f"campaign.{ending}", rows, result.to_json())
         if picture := picture_or_log(partial(draw_campaign, result), terminal.log):
             (folder / "campaign.png").write_bytes(picture)
     columns = ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]")
     cells = []
-    for made in result.runs:
-        figures, clearance = made.figures, f"{1e3 * made.figures.min_needle_clearance_m:.3f}"
+    for seed_run in result.runs:
+        figures, clearance = seed_run.figures, f"{1e3 * seed_run.figures.min_needle_clearance_m:.3f}"
         times = (f"{figures.time_s:.1f}", f"{figures.ideal_time_s:.1f}", clearance, f"{figures.longest_rest_s:.2f}")
-        counts = (str(made.seed), "yes" if made.success else "no", str(made.goals_met))
+        counts = (str(seed_run.seed), "yes" if seed_run.success else "no", str(seed_run.goals_met))
         cells.append((*counts, *times, f"{figures.wrap_degrees:.0f}"))
     terminal.print(command.make_table(f"{result.title} (simulated)", columns, cells, left=0))
     terminal.log(f"results: {options.output}")
@@ -124,7 +124,7 @@ class CampaignResult:
     @property
     def successes(self) -> int:
         """Runs in which every goal was reached and every limit held."""
-        return sum(made.success for made in self.runs)
+        return sum(outcome.success for outcome in self.runs)
 
     @property
     def title(self) -> str:
@@ -140,7 +140,7 @@ class CampaignResult:
             "camera": self.camera,
             "simulated": True,
             "successes": self.successes,
-            "runs": [made.to_json() for made in self.runs],
+            "runs": [outcome.to_json() for outcome in self.runs],
             "died": {str(seed): reason for seed, reason in self.died.items()},
         }
 
@@ -160,8 +160,8 @@ def _run(
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
         recorder = None if bag is None else RunBag(bag, setup, camera=camera)
-        found = run.run_procedure(procedure, setup, run.vary(setup, seed), camera=camera, recorder=recorder)
-    return found, process_time() - began
+        result = run.run_procedure(procedure, setup, run.vary(setup, seed), camera=camera, recorder=recorder)
+    return result, process_time() - began
 
 
 def draw_campaign(result: CampaignResult) -> bytes:
@@ -172,7 +172,7 @@ def draw_campaign(result: CampaignResult) -> bytes:
     """
     from magnetosuture_thread.evaluation import plots  # late, as it imports matplotlib
 
-    failed = [made for made in result.runs if not made.success][:MAX_PANELS]
+    failed = [outcome for outcome in result.runs if not outcome.success][:MAX_PANELS]
     rows = -(-len(failed) // 4)
     height = 3.3 + 3.6 * rows
     figure = plots.make_figure(14.0, height)
@@ -184,8 +184,8 @@ def draw_campaign(result: CampaignResult) -> bytes:
         )
     for text, below, size in ((title, 0.15, 14), (words, 0.5, 9.5)):
         figure.text(0.015, 1.0 - below / height, text, fontsize=size, color=plots.INK, va="top", parse_math=False)
-    colours = [plots.GOOD if made.success else plots.BAD for made in result.runs]
-    seeds = [made.seed for made in result.runs]
+    colours = [plots.GOOD if outcome.success else plots.BAD for outcome in result.runs]
+    seeds = [outcome.seed for outcome in result.runs]
     keep_out = result.setup.coils.keep_out - run.KEEP_OUT_TOLERANCE
     panels = (
         ("clearance of the needle's axis [mm]", "min_needle_clearance_m", 1e3, keep_out),
@@ -195,16 +195,16 @@ def draw_campaign(result: CampaignResult) -> bytes:
     )
     for column, (title, name, scale, limit) in enumerate(panels):
         axes = figure.add_axes((0.035 + 0.25 * column, 1.0 - 2.8 / height, 0.2, 1.7 / height))
-        axes.scatter(seeds, [scale * getattr(made.figures, name) for made in result.runs], c=colours, s=22)
+        axes.scatter(seeds, [scale * getattr(outcome.figures, name) for outcome in result.runs], c=colours, s=22)
         axes.axhline(scale * limit, color=plots.FAINT, linewidth=0.9, linestyle=(0, (4, 3)))
         axes.set_title(title, fontsize=9.5, color=plots.INK, loc="left")
         axes.set_xlabel("seed", fontsize=8.5, color=plots.INK, labelpad=1)
         plots.tidy(axes)
-    for index, made in enumerate(failed):
+    for index, outcome in enumerate(failed):
         row, column = divmod(index, 4)
         axes = figure.add_axes((0.01 + 0.2475 * column, (3.6 * (rows - 1 - row) + 0.05) / height, 0.24, 3.1 / height))
-        axes.set_title(f"seed {made.seed}: {shortened(made.reason, 38)}", fontsize=9, color=plots.INK, loc="left")
-        _draw_failed_run(axes, made, result)
+        axes.set_title(f"seed {outcome.seed}: {shortened(outcome.reason, 38)}", fontsize=9, color=plots.INK, loc="left")
+        _draw_failed_run(axes, outcome, result)
     return plots.to_png(figure)
 
 

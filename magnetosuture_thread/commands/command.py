@@ -66,9 +66,9 @@ def add_actions(
     parsers = []
     for name, run in actions.items():
         summary = (inspect.getdoc(run) or "").partition("\n")[0].rstrip(".")
-        own = subparsers.add_parser(name.replace("_", "-"), help=summary[:1].lower() + summary[1:])
-        runs(own, run)
-        parsers.append(own)
+        subparser = subparsers.add_parser(name.replace("_", "-"), help=summary[:1].lower() + summary[1:])
+        runs(subparser, run)
+        parsers.append(subparser)
     return parsers
 
 

@@ -214,8 +214,8 @@ class RecordingHost(GraphHost):
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
         recording = "" if self._recording is None else str(self._recording.output)
-        own = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
-        return {**super().state(), **own}
+        state = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
+        return {**super().state(), **state}
 
     def notes(self, operator: str) -> dict[str, str]:
         """Return the notes of a recording, which the page that has control began.
@@ -345,7 +345,7 @@ class SimulatedHost(RecordingHost):
         if not self.busy:
             return
         nodes = self.graph.nodes().items()
-        live.log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
+        live.log_compiling({name: report["message"] for name, report in nodes}, self._logged, self.log)
         missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have

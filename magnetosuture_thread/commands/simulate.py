@@ -77,10 +77,10 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
     new = not options.output.exists()
-    given = command.given(options, "duration", "rate", "boards", "procedure")
+    chosen = command.given(options, "duration", "rate", "boards", "procedure")
     try:
         with terminal.progress("simulate") as advance:
-            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **given)
+            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **chosen)
     except KeyboardInterrupt:
         if new and options.output.exists():
             terminal.log(f"what was recorded is in {options.output}")
@@ -163,8 +163,8 @@ def simulate(
         summary = replace(summary, procedure=task.result, too_slow=slow)
         figures = summary.to_json()
     except GraphError as error:
-        told = "{}: {}, {}; ".format(*outcome_line(task.result)) if task.result else ""
-        raise GraphError(f"{told}{error}") from None
+        words = "{}: {}, {}; ".format(*outcome_line(task.result)) if task.result else ""
+        raise GraphError(f"{words}{error}") from None
     finally:
         if task.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")

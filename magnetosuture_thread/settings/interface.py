@@ -182,7 +182,7 @@ class Service(str, Enum):
     PAUSE_RIG = "rig/pause", "std_srvs/srv/SetBool", "rig_simulator"
 
 
-SERVICES = {each.value: each for each in Service}  # by name
+SERVICES = {service.value: service for service in Service}  # by name
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 
