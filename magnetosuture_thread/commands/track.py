@@ -325,10 +325,10 @@ def _files_at(path: Path) -> list[Path]:
     except (OSError, ValueError) as error:
         raise BagError(path, f"cannot be read: {error}") from None
     endings = (*PICTURES, *STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)
-    found = [file for file in inside if file.name.lower().endswith(endings) and file.is_file()]
-    if not found:
+    files = [file for file in inside if file.name.lower().endswith(endings) and file.is_file()]
+    if not files:
         raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
-    return found
+    return files
 
 
 def numbered(names: Sequence[str], form: str) -> list[str]:
@@ -348,14 +348,14 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
 
 def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> Track:
     """Return what a frame shows."""
+    if frame.image is None:
+        return no_pose(State.LOST, frame.problem, None)
     try:
-        if frame.image is None:
-            raise InvalidInputError("image", "a broken picture", frame.problem)
         if in_sequence and frame.stamp is not None:
             return tracker.track(frame.image, frame.stamp)
         return tracker.look(frame.image)
     except InvalidInputError as error:
-        return no_pose(State.LOST, frame.problem or str(error), None)
+        return no_pose(State.LOST, str(error), None)
 
 
 def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
@@ -371,7 +371,7 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
     pose: dict[str, Any] = dict.fromkeys(names)
     if not track.reason:
         angle, pieces = np.arctan2(track.heading[1], track.heading[0]), map(_piece, track.observation.pieces)
-        values = (track.tail, angle, track.tip, np.float64(track.curvature), track.centreline)
+        values = (track.tail, angle, track.tip, track.curvature, track.centreline)
         pose = dict(zip(names, (*map(_finite, values), list(pieces)), strict=True))
     return {
         "file": frame.name,
@@ -383,17 +383,18 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         "metres_per_pixel": None if track.view is None else track.view.metres_per_pixel,
         "scale_doubt": None if track.view is None else track.scale_error,
         **pose,
-        "needle_length_m": None if track.needle_length is None else _finite(np.float64(track.needle_length)),
+        "needle_length_m": _finite(track.needle_length),
         "complete": track.observation.complete,
-        "confidence": _finite(np.float64(track.confidence)),
+        "confidence": _finite(track.confidence),
         "time_s": duration,
         "stamp_s": frame.stamp,
     }
 
 
-def _finite(values: np.ndarray | np.float64) -> Any:
-    """Return a number, or an array as lists; None where any of it is not finite."""
-    return values.tolist() if np.isfinite(values).all() else None
+def _finite(values: Any) -> Any:
+    """Return a number, or an array as lists; None where any of it is not finite, or there is none."""
+    array = np.asarray(np.nan if values is None else values, dtype=float)
+    return array.tolist() if np.isfinite(array).all() else None
 
 
 def _piece(piece: ThreadPiece) -> dict[str, Any]:
@@ -403,7 +404,7 @@ def _piece(piece: ThreadPiece) -> dict[str, Any]:
         "deviation_m": piece.deviation.tolist(),
         "first_end": piece.first_end.name.lower(),
         "last_end": piece.last_end.name.lower(),
-        "arc_length_m": [_finite(np.float64(value)) for value in piece.arc_length],
+        "arc_length_m": [_finite(value) for value in piece.arc_length],
         "direction_known": piece.direction_known,
         "confidence": piece.confidence,
     }
