@@ -270,9 +270,9 @@ def make_table(
     table = Table(title=title, caption=caption or None, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")
     for index, name in enumerate(columns):
         if index < left:
-            table.add_column(name, overflow="fold", min_width=min(12, 12 - 6 * index))
+            table.add_column(Text(name), overflow="fold", min_width=min(12, 12 - 6 * index))
         else:
-            table.add_column(name, justify="right", no_wrap=True)
+            table.add_column(Text(name.replace(" [", "\n[")), justify="right", no_wrap=True)  # the unit below
     for row in rows:
         table.add_row(*map(Text, row))
     return table
