@@ -14,8 +14,9 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
+from benchmarks.report import figures_table
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.geometry.polyline import lay_behind_needle
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.setups import read_setup
@@ -29,18 +30,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="show the functions with their calls")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Count one frame; return the figures, by folder and of all. There is no limit to pass."""
     calls = count_frame()
     figures: dict[str, Any] = {}
     for folder in (*sorted({file.partition("/")[0] for file, _ in calls}), ""):
-        own = {key: count for key, count in calls.items() if key[0].startswith(folder)}
-        files = {file for file, _ in own}
-        figures[folder or "all"] = {"files": len(files), "functions": len(own), "calls": sum(own.values())}
+        inside = {key: count for key, count in calls.items() if key[0].startswith(folder)}
+        sums = {"files": len({file for file, _ in inside}), "functions": len(inside), "calls": sum(inside.values())}
+        figures[folder or "all"] = sums
     for (file, function), count in sorted(calls.items()) if options.list else ():
-        console.print(f"{count:6d}  {file}  {function}", soft_wrap=True)
-    for folder, found in figures.items():
-        console.print(f"{folder:16}" + ", ".join(f"{count:4d} {name}" for name, count in found.items()))
+        terminal.print(f"{count:6d}  {file}  {function}", soft_wrap=True)
+    rows = [{"folder": folder, **sums} for folder, sums in figures.items()]
+    names = ("folder", "files", "functions", "calls")
+    terminal.print(figures_table("one frame", rows, {name: f"{{{name}}}" for name in names}))
     return figures, True
 
 

@@ -3,55 +3,36 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from rich.table import Table
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from benchmarks.report import figures_table
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 
 RATE = 60.0
-POST = 1e-3  # m
-DIAMETER = 60e-6  # m, of the thread
+POST, DIAMETER = 1e-3, 60e-6  # m; radius of the post, and of the thread
+RADIUS = POST + 0.5 * DIAMETER  # m, of the thread's centreline on the post
 SPEED = 1e-3  # m/s
 DRAG = 0.5  # Pa s, along the thread; twice as much across
 LEAD = 4e-3  # m, of thread before the post
 PER_TURN = 40  # segments
-STEPS = 40
-MEASURED = 20  # of these steps, the last ones
-SETTLING = 80  # steps until the ends of a stiff thread's contact have found their places
-STIFFNESSES = (0.2, 0.4)  # E I / (T_1 R^2) of stiff threads
 EAST = np.array([1.0, 0.0])
 
+Vector = NDArray[np.float64]
 
-def measure_friction() -> dict[str, Any]:
-    """Return the figures."""
-    capstans = [
+
+def measure_friction() -> list[dict[str, float]]:
+    """Return the figures of flexible threads."""
+    return [
         {"friction": friction, "turns": turns, "error_percent": capstan_error(friction, 2.0 * math.pi * turns)}
         for friction in (0.1, 0.2, 0.3, 0.4, 0.5)
         for turns in (0.25, 0.5, 1.0, 2.0)
     ]
-    stiff = [
-        {"friction": friction, "stiffness": stiffness, **stiff_capstan(friction, stiffness)._asdict()}
-        for friction in (0.3, 0.5)
-        for stiffness in STIFFNESSES
-    ]
-    return {"capstans": capstans, "stiff_capstans": stiff}
-
-
-def friction_tables(figures: dict[str, Any]) -> tuple[Table, Table]:
-    """Return the figures as tables."""
-    error = {"mu": "{friction:g}", "turns": "{turns:g}", "off [%]": "{error_percent:+.2f}"}
-    ratios = {"mu": "{friction:g}", "E I [T1 R^2]": "{stiffness:g}", "T2 / T1": "{measured:.3f}"}
-    ratios |= {"by elastica theory": "{elastica:.3f}", "flexible": "{flexible:.3f}"}
-    return (
-        figures_table("capstans: T2 / T1 over exp(mu theta), less 1", figures["capstans"], error),
-        figures_table("stiff capstans, 0.5 turns", figures["stiff_capstans"], ratios),
-    )
 
 
 def capstan(friction: float, angle: float, free: int, stiffness: float = 0.0) -> tuple[ThreadPredictor, Points]:
@@ -63,14 +44,13 @@ def capstan(friction: float, angle: float, free: int, stiffness: float = 0.0) ->
         free: segments behind the post.
         stiffness: E I [N m^2].
     """
-    radius = POST + 0.5 * DIAMETER
-    segment = 2.0 * math.pi * radius / PER_TURN
-    segments = round((LEAD + angle * radius) / segment) + free
+    segment = 2.0 * math.pi * RADIUS / PER_TURN
+    segments = round((LEAD + angle * RADIUS) / segment) + free
     at = segment * np.arange(segments + 1)
-    turned = math.pi / 2 + np.clip((at - LEAD) / radius, 0.0, angle)
-    tail = np.clip(at - LEAD - angle * radius, 0.0, None)
-    x = radius * np.cos(turned) - tail * np.sin(turned) + np.clip(LEAD - at, 0.0, None)
-    nodes = np.column_stack([x, radius * np.sin(turned) + tail * np.cos(turned)])
+    turned = math.pi / 2 + np.clip((at - LEAD) / RADIUS, 0.0, angle)
+    tail = np.clip(at - LEAD - angle * RADIUS, 0.0, None)
+    x = RADIUS * np.cos(turned) - tail * np.sin(turned) + np.clip(LEAD - at, 0.0, None)
+    nodes = np.column_stack([x, RADIUS * np.sin(turned) + tail * np.cos(turned)])
     medium = Medium(2.0 * DRAG, DRAG)
     thread = Thread("capstan", segments * segment, segments, DIAMETER, stiffness, medium, Attachment.PINNED)
     predictor = ThreadPredictor(thread, Workspace((Disc((0.0, 0.0), POST),), 2e-3, friction=(friction,)))
@@ -78,21 +58,39 @@ def capstan(friction: float, angle: float, free: int, stiffness: float = 0.0) ->
     return predictor, nodes
 
 
+def _slide(
+    predictor: ThreadPredictor, nodes: Points, skipped: int, steps: int
+) -> Iterator[tuple[Vector, Vector, int, int]]:
+    """Draw a thread around its post; yield tensions and angles of the segments, and those before and behind the post.
+
+    Args:
+        predictor: that has the thread.
+        nodes: at its start.
+        skipped: steps before the first that is yielded.
+        steps: that are yielded.
+    """
+    for k in range(1, skipped + steps + 1):
+        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST))
+        if k > skipped:
+            forces, along = prediction.forces, np.diff(prediction.positions, axis=0)
+            assert forces is not None
+            touching = np.flatnonzero(forces.friction_use > 0.0)
+            yield forces.tension, np.unwrap(np.arctan2(along[:, 1], along[:, 0])), touching[0] - 1, touching[-1]
+
+
 def capstan_error(friction: float, angle: float, free: int = 250) -> float:
     """Return by how much T_2 / T_1 differs from exp(mu theta), the drag on the post's part taken off [%]."""
     predictor, nodes = capstan(friction, angle, free)
-    radius, ratios = POST + 0.5 * DIAMETER, []
-    for k in range(1, STEPS + 1):
-        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST))
-        forces, along = prediction.forces, np.diff(prediction.positions, axis=0)
-        assert forces is not None
-        touching = np.flatnonzero(forces.friction_use > 0.0)
-        first, last = touching[0] - 1, touching[-1]  # segments before and behind the post
-        theta = np.ptp(np.unwrap(np.arctan2(along[:, 1], along[:, 0]))[first : last + 1])
-        gain = math.exp(friction * theta)
-        drag = DRAG * SPEED * radius * (gain - 1.0) / friction
-        ratios.append((forces.tension[first] - drag) / (forces.tension[last] * gain))
-    return 100.0 * (float(np.mean(ratios[-MEASURED:])) - 1.0)
+    ratios = []
+    for tension, angles, first, last in _slide(predictor, nodes, 20, 20):
+        gain = math.exp(friction * np.ptp(angles[first : last + 1]))
+        ratios.append((tension[first] - _drag(friction, gain)) / (tension[last] * gain))
+    return 100.0 * (float(np.mean(ratios)) - 1.0)
+
+
+def _drag(friction: float, gain: float) -> float:
+    """Return what drag on the post's part adds to the tension before it [N]."""
+    return DRAG * SPEED * RADIUS * (gain - 1.0) / friction
 
 
 class StiffCapstan(NamedTuple):
@@ -133,27 +131,19 @@ def elastica_ratio(friction: float, angle: float, stiffness: float) -> float:
 
 def stiff_capstan(friction: float, stiffness: float, free: int = 250) -> StiffCapstan:
     """Return what a thread with E I = `stiffness` T_1 R^2 that slides around half a post comes to."""
-    radius = POST + 0.5 * DIAMETER
-    segment = 2.0 * math.pi * radius / PER_TURN
-    predictor, nodes = capstan(friction, math.pi, free, stiffness * DRAG * SPEED * free * segment * radius**2)
-    layer, found = math.ceil(4.0 * math.sqrt(stiffness) * radius / segment), []  # segments in which an end is bent
-    for k in range(1, SETTLING + STEPS + 1):
-        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST))
-        if k <= SETTLING:
-            continue
-        forces, along = prediction.forces, np.diff(prediction.positions, axis=0)
-        assert forces is not None
-        touching = np.flatnonzero(forces.friction_use > 0.0)
-        first, last = touching[0] - 1, touching[-1]  # segments before and behind the post
-        theta = np.ptp(np.unwrap(np.arctan2(along[:, 1], along[:, 0]))[[2, -free // 2]])
+    segment = 2.0 * math.pi * RADIUS / PER_TURN
+    predictor, nodes = capstan(friction, math.pi, free, stiffness * DRAG * SPEED * free * segment * RADIUS**2)
+    layer, ratios = math.ceil(4.0 * math.sqrt(stiffness) * RADIUS / segment), []  # segments in which an end is bent
+    # 80 steps go by until the ends of the contact have found their places.
+    for tension, angles, first, last in _slide(predictor, nodes, 80, 40):
+        theta = float(np.ptp(angles[[2, -free // 2]]))
         # Drag makes the tension of a straight part linear: it is taken at the post, from where the thread is straight.
         before, behind = np.arange(2, first - layer // 2), np.arange(last + layer, last + free // 2)
         high, low = (
-            np.polyval(np.polyfit(part, forces.tension[part], 1), end)
+            float(np.polyval(np.polyfit(part, tension[part], 1), end))
             for part, end in ((before, first), (behind, last))
         )
         gain = math.exp(friction * theta)
-        ratio = float((high - DRAG * SPEED * radius * (gain - 1.0) / friction) / low)
-        bent = predictor.thread.bending_stiffness / (low * radius**2)
-        found.append((ratio, elastica_ratio(friction, float(theta), float(bent)), gain))
-    return StiffCapstan(*np.mean(found, axis=0).tolist())
+        bent = predictor.thread.bending_stiffness / (low * RADIUS**2)
+        ratios.append(((high - _drag(friction, gain)) / low, elastica_ratio(friction, theta, bent), gain))
+    return StiffCapstan(*np.mean(ratios, axis=0).tolist())

@@ -12,9 +12,7 @@ import argparse
 import cmath
 import contextlib
 import copy
-import dataclasses
 import math
-import sys
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -22,13 +20,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-from rich.console import Console
 
 from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import MAX_BLIND_DISTANCE, CoilBridgeSettings
-from magnetosuture_thread.commands.command import make_log
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.geometry.scene_files import shape_from_mapping
@@ -37,9 +34,8 @@ from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInpu
 TOLERANCE = 5e-6  # m; deeper is a violation
 READY = DriverState(True)
 SUBSTEP = 2e-5  # m of way between two looks at the clearance
-REPORT_EVERY = 500.0  # s of simulated time
+KEEP_OUTS = ((5e-5, 3e-4), (3e-4, 1e-3))  # m
 START = 100.0  # s; time of the first step
-EPISODE = 4.0  # s of simulated time with the same parameters and scene
 
 
 @dataclass
@@ -138,9 +134,7 @@ def random_settings(random: np.random.Generator) -> CoilBridgeSettings:
                 max_acceleration=float(10.0 ** random.uniform(-1.0, 2.0)),
                 max_current_slew=float(10.0 ** random.uniform(2.0, 5.0)),
                 max_current=float(random.uniform(2.0, 30.0)),
-                keep_out=float(
-                    max(0.5 * width, random.choice([random.uniform(5e-5, 3e-4), random.uniform(3e-4, 1e-3)]))
-                ),
+                keep_out=max(0.5 * width, float(random.choice([random.uniform(a, b) for a, b in KEEP_OUTS]))),
                 approach_rate=float(min(rate, 10.0 ** random.uniform(-0.5, 2.5))),
                 needle_length=length,
                 needle_width=width,
@@ -155,35 +149,34 @@ def random_scene(random: np.random.Generator) -> Scene:
     radius = float(random.uniform(0.008, 0.025))
     shapes: list[SceneShape] = []
 
-    def add(description: dict[str, object]) -> None:
+    def add(**description: object) -> None:
         with contextlib.suppress(ConfigurationError):  # what bounds no area is left out
             shapes.append(shape_from_mapping(f"shape_{len(shapes)}", description))
 
-    def add_polygon(corners: np.ndarray, angle: float, centre: np.ndarray) -> None:
+    def add_polygon(corners: Any, angle: float, centre: np.ndarray) -> None:
         c, s = math.cos(angle), math.sin(angle)
-        add({"polygon": {"outline": (corners @ np.array([[c, s], [-s, c]]) + centre).tolist()}})
+        add(polygon={"outline": (np.array(corners) @ np.array([[c, s], [-s, c]]) + centre).tolist()})
 
     for _ in range(int(random.integers(0, 5))):
         kind = int(random.integers(0, 7))
         centre = 0.9 * radius * math.sqrt(random.uniform()) * _unit(random.uniform(-math.pi, math.pi))
         size, angle = float(random.uniform(0.05, 0.4)) * radius, float(random.uniform(-math.pi, math.pi))
         if kind == 0:
-            add({"disc": {"center": centre.tolist(), "radius": 0.5 * size}})
+            add(disc={"center": centre.tolist(), "radius": 0.5 * size})
         elif kind == 1:  # a splinter
-            add_polygon(size * np.array([(0.0, 0.0), (2.0, 0.02), (0.0, 0.1)]), angle, centre)
+            add_polygon([(0.0, 0.0), (2.0 * size, 0.02 * size), (0.0, 0.1 * size)], angle, centre)
         elif kind == 2:  # a star
             count = int(random.integers(3, 9))
             radii, turn = np.tile([size, 0.35 * size], count), math.pi * np.arange(2 * count) / count
-            add_polygon(np.column_stack([radii * np.cos(turn), radii * np.sin(turn)]), angle, centre)
+            add_polygon((radii * [np.cos(turn), np.sin(turn)]).T, angle, centre)
         elif kind == 3:
             inner = float(random.uniform(0.3, 0.8)) * radius
-            add({"annulus": {"center": (0.3 * centre).tolist(), "inner_radius": inner, "outer_radius": 1.2 * inner}})
+            add(annulus={"center": (0.3 * centre).tolist(), "inner_radius": inner, "outer_radius": 1.2 * inner})
         elif kind == 4:  # a channel
             gap, long, thick = float(random.uniform(5e-4, 3e-3)), 2.0 * size, 0.3 * size
             for side in (1.0, -1.0):
                 low, high = sorted((0.5 * side * gap, 0.5 * side * (gap + 2.0 * thick)))
-                corners = [(-long, low), (long, low), (long, high), (-long, high)]
-                add_polygon(np.array(corners), angle, 0.3 * centre)
+                add_polygon([(-long, low), (long, low), (long, high), (-long, high)], angle, 0.3 * centre)
         elif kind == 5:  # a U
             gap, thick = float(random.uniform(1e-3, 4e-3)), 0.2 * size
             x = [0.0, size, size, thick, thick, size, size, 0.0]
@@ -192,7 +185,7 @@ def random_scene(random: np.random.Generator) -> Scene:
         else:  # rough
             turn = np.sort(random.uniform(-math.pi, math.pi, 40))
             radii = size * random.uniform(0.6, 1.0, 40)
-            add_polygon(np.column_stack([radii * np.cos(turn), radii * np.sin(turn)]), angle, centre)
+            add_polygon((radii * [np.cos(turn), np.sin(turn)]).T, angle, centre)
     while True:
         try:
             return Scene(Dish(2.0 * radius, 0.003), tuple(shapes))
@@ -202,7 +195,7 @@ def random_scene(random: np.random.Generator) -> Scene:
 
 @dataclass
 class Tally:
-    """What was found."""
+    """What was tally."""
 
     seconds: float = 0.0
     steps: int = 0
@@ -216,17 +209,17 @@ class Tally:
     worst: list[dict[str, object]] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Add what another found."""
+        """Add what another tally."""
         deepest = max(self.deepest, other.deepest)
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
         self.deepest = deepest
 
 
-def attack(seed: int, duration: float = EPISODE) -> Tally:
-    """Drive a needle for a while with random parameters in a random scene, all told by the seed."""
+def attack(seed: int, duration: float = 4.0) -> Tally:
+    """Drive a needle for a while with random parameters in a random scene, all given by the seed."""
     random = np.random.default_rng(seed)
-    found = Tally(episodes=1)
+    tally = Tally(episodes=1)
     for _ in range(100):
         settings, scene = random_settings(random), random_scene(random)
         world = World(scene)
@@ -234,11 +227,11 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
         if needle is not None:
             break
     else:
-        return found
+        return tally
     try:
         bridge = CoilBridge(settings, ArmingLatch(), scene)
     except ConfigurationError:
-        return found
+        return tally
     bridge.latch.activate()
     bridge.arm(READY)
     period, now, end = 1.0 / settings.rate, START, START + duration
@@ -274,47 +267,47 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
             command = _towards(needle, world, settings.max_speed, mode, random)
         elif mode == 4:
             command = settings.max_speed * _unit(random.uniform(-math.pi, math.pi))
-        bridge.command("needle", command, now, found.steps + 1, now, now)
+        bridge.command("needle", command, now, tally.steps + 1, now, now)
         bridge.on_margins(now, True, 1.0, scene.version, now)
         outcome = bridge.step(now, now, READY)
         if bridge.latch.fault.startswith("needle does not follow"):  # after a stall nobody knows how it has moved
-            found.faults += 1
+            tally.faults += 1
             bridge.reset(READY)
             bridge.arm(READY)
         elif bridge.latch.fault:
             raise AssertionError(f"seed {seed}: {bridge.latch.fault}")
         velocity = complex(*outcome.applied)
-        found.steps += 1
-        found.driven += abs(velocity) > 0.0
-        gap, moving = _gap(random, settings, found)
+        tally.steps += 1
+        tally.driven += abs(velocity) > 0.0
+        gap, moving = _gap(random, settings, tally)
         way = abs(velocity) * moving * _swing(needle)
         if way > 0.0:
             if clearance - way < settings.keep_out:
                 count = min(400, max(2, math.ceil(way / SUBSTEP)))
                 axes = [needle.moved(velocity, moving * k / count).points() for k in range(1, count + 1)]
-                found.pressed += 1
+                tally.pressed += 1
                 depth = settings.keep_out - world.clearance(axes)
-                found.deepest = max(found.deepest, depth)
+                tally.deepest = max(tally.deepest, depth)
                 if depth > TOLERANCE:
-                    found.violations += 1
-                    found.worst.append({"seed": seed, "time": now - START, "deeper": depth})
+                    tally.violations += 1
+                    tally.worst.append({"seed": seed, "time": now - START, "deeper": depth})
             while next_pose < now + moving:  # poses fall due within the motion too
                 measure(needle.moved(velocity, next_pose - now), next_pose)
                 next_pose += pose_period
             needle = needle.moved(velocity, moving)
             clearance = world.clearance([needle.points()])
         now += gap
-        found.seconds += gap
-    return found
+        tally.seconds += gap
+    return tally
 
 
-def _gap(random: np.random.Generator, settings: CoilBridgeSettings, found: Tally) -> tuple[float, float]:
+def _gap(random: np.random.Generator, settings: CoilBridgeSettings, tally: Tally) -> tuple[float, float]:
     """Return the time to the next step, a stall now and then, and for how long of it the coils hold their currents."""
     period, certain = 1.0 / settings.rate, min(settings.command_timeout, settings.driver_timeout)
     gap = period
     if random.uniform() < 0.05:
         gap = max(period, float(random.choice([1.0, 1.5, random.uniform()])) * settings.driver_timeout)
-        found.stalls += 1
+        tally.stalls += 1
     if gap <= certain:
         return gap, gap
     # When nobody asks for currents, the coils stop at some time between both timeouts.
@@ -362,19 +355,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Attack the promise; return the figures and whether it was kept."""
-    log, total, began, shown = make_log(console), Tally(), time.process_time(), 0.0
-    while total.seconds < options.seconds:
-        total.add(attack(options.seed + total.episodes))
-        if total.seconds >= shown + REPORT_EVERY:
-            shown = total.seconds
-            print(f"{shown:.0f} s, {total.violations} violations", file=sys.stderr, flush=True)
+    total, began = Tally(), time.process_time()
+    with terminal.progress("keep-out") as advance:
+        while total.seconds < options.seconds:
+            total.add(attack(options.seed + total.episodes))
+            advance(total.seconds / options.seconds)
     deepest = None if math.isinf(total.deepest) else total.deepest  # the needle was never near; JSON has no infinity
-    found = {"worst": total.worst[:20], "deepest": deepest, "cpu_seconds": time.process_time() - began}
-    log(
+    terminal.log(
         f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls, "
-        f"{total.faults} faults: "
-        f"{total.violations} violations beyond {1e6 * TOLERANCE:g} um, deepest {1e6 * total.deepest:.4f} um"
+        f"{total.faults} faults: {total.violations} violations beyond {1e6 * TOLERANCE:g} um, "
+        f"deepest {1e6 * total.deepest:.4f} um"
     )
-    return {**dataclasses.asdict(total), **found}, not total.violations
+    figures = {**vars(total), "worst": total.worst[:20], "deepest": deepest}
+    return {**figures, "cpu_seconds": time.process_time() - began}, not total.violations

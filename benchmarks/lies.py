@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
+from benchmarks.closed_loop import PathControl
 from benchmarks.keep_out import World
+from benchmarks.report import figures_table
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.rig.campaign import vary
 from magnetosuture_thread.rig.closed_loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.rig.rig import Rig, RigFrame
@@ -32,10 +33,10 @@ SETUPS = ("hernia_ring", "dish_50mm", "petri_35mm_polyamide", "petri_35mm_polyam
 BEGIN, AFTER = (2.0, 8.0), 2.0  # s; when a lie begins, and for how long it is watched
 AVERAGING = 10  # periods of the bridge over which a speed is taken
 CLEAR = 2e-3  # m; from wall and shapes, for a lie that must not break the keep-out
-HALF_TURN, QUARTER_TURN = -np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])
+STRAIGHT, HALF_TURN, QUARTER_TURN = np.eye(2), -np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
-def _mapped(measured: Measurement, turn: Vector, shift: Vector) -> Measurement:
+def _mapped(measured: Measurement, shift: Vector | float = 0.0, turn: Vector = STRAIGHT) -> Measurement:
     """Return a measurement turned about the dish's centre and shifted, shapes (2, 2) and (2,) [m]."""
     seen = measured.observation
     if seen is not None:
@@ -50,10 +51,16 @@ class Liar:
         kind: of the lie, one of `LIES`.
         begin: time of the first lie [s].
         random: of its noise.
+
+    Attributes:
+        last: the last honest measurement.
+        past: the last ten of them.
+        walked: where a random walk is, shape (2,) [m].
+        count: lies told.
     """
 
     def __init__(self, kind: str, begin: float, random: np.random.Generator) -> None:
-        self._make, self._begin, self.random = LIES[kind], begin, random
+        self._lie, self._begin, self.random = LIES[kind], begin, random
         self.past: deque[Measurement] = deque(maxlen=10)
         self.walked, self.count = np.zeros(2), 0
 
@@ -61,49 +68,45 @@ class Liar:
         """Return a measurement as the bridge gets it."""
         if measured.stamp - START < self._begin or not self.past:
             self.past.append(measured)
+            self.last = measured
             return measured
-        told = self._make(self, measured)
+        lie = self._lie(self, measured)
         self.count += 1
-        return replace(told, due=measured.due, stamp=measured.stamp)
+        return replace(lie, due=measured.due, stamp=measured.stamp)
 
-    @property
-    def last(self) -> Measurement:
-        """The last honest measurement."""
-        return self.past[-1]
 
-    def walk(self) -> Vector:
-        """Return where a random walk is now, shape (2,) [m]."""
-        self.walked = self.walked + 2e-4 * self.random.standard_normal(2)
-        return self.walked
+def _walk(liar: Liar, _: Measurement) -> Measurement:
+    liar.walked = liar.walked + 2e-4 * liar.random.standard_normal(2)
+    return _mapped(liar.last, liar.walked)
 
 
 def _circle(liar: Liar, measured: Measurement) -> Measurement:
     angle = 3.0 * (measured.stamp - liar.last.stamp)
-    return _mapped(liar.last, np.eye(2), 1e-3 * np.array([math.cos(angle) - 1.0, math.sin(angle)]))
+    return _mapped(liar.last, 1e-3 * np.array([math.cos(angle) - 1.0, math.sin(angle)]))
 
 
 def _drift(liar: Liar, measured: Measurement) -> Measurement:
-    return _mapped(measured, np.eye(2), np.array([5e-3 * (measured.stamp - liar.last.stamp), 0.0]))
+    return _mapped(measured, np.array([5e-3 * (measured.stamp - liar.last.stamp), 0.0]))
 
 
 def _moved(liar: Liar, measured: Measurement, turn: Vector) -> Measurement:
     """Return a needle whose motion since the lie began is turned."""
     moved = measured.tail - liar.last.tail
-    return _mapped(measured, np.eye(2), turn @ moved - moved)
+    return _mapped(measured, turn @ moved - moved)
 
 
 LIES: dict[str, Callable[[Liar, Measurement], Measurement]] = {
     "frozen": lambda liar, _: liar.last,
-    "frozen, 10 um of noise": lambda liar, _: _mapped(liar.last, np.eye(2), 1e-5 * liar.random.standard_normal(2)),
+    "frozen, 10 um of noise": lambda liar, _: _mapped(liar.last, 1e-5 * liar.random.standard_normal(2)),
     "the last ten frames": lambda liar, _: liar.past[liar.count % len(liar.past)],
     "heading turned by 180 degrees": lambda _, m: replace(m, heading=-m.heading),
-    "image turned by 180 degrees": lambda _, m: _mapped(m, HALF_TURN, np.zeros(2)),
-    "image turned by 90 degrees": lambda _, m: _mapped(m, QUARTER_TURN, np.zeros(2)),
-    "image mirrored": lambda _, m: _mapped(m, np.diag([-1.0, 1.0]), np.zeros(2)),
+    "image turned by 180 degrees": lambda _, m: _mapped(m, turn=HALF_TURN),
+    "image turned by 90 degrees": lambda _, m: _mapped(m, turn=QUARTER_TURN),
+    "image mirrored": lambda _, m: _mapped(m, turn=np.diag([-1.0, 1.0])),
     "moves oppositely": lambda liar, m: _moved(liar, m, HALF_TURN),
     "moves sideways": lambda liar, m: _moved(liar, m, QUARTER_TURN),
-    "5 mm beside": lambda _, m: _mapped(m, np.eye(2), np.array([5e-3, 0.0])),
-    "walks at random": lambda liar, _: _mapped(liar.last, np.eye(2), liar.walk()),
+    "5 mm beside": lambda _, m: _mapped(m, np.array([5e-3, 0.0])),
+    "walks at random": _walk,
     "goes in a circle": _circle,
     "drifts at 5 mm/s": _drift,
     "none": lambda _, m: m,
@@ -124,16 +127,10 @@ def run_lie(case: tuple[str, str, int]) -> dict[str, Any]:
     """Run one lie, from a setup's name, the lie's and a seed; return what the true needle did."""
     name, kind, seed = case
     setup, random = read_setup(name), np.random.default_rng([seed, 2])
-    varied, begin, follower = vary(setup, seed), float(random.uniform(*BEGIN)), setup.follower.follower()
+    varied, begin = vary(setup, seed), float(random.uniform(*BEGIN))
     rig = Rig(varied.setup.rig, setup.scene)
-    loop = LyingLoop(
-        setup,
-        rig,
-        lambda stamp, tail, heading, condition: follower.compute_command(stamp, tail, heading).velocity,
-        seed,
-        losses=varied.losses,
-        coil_gains=varied.coil_gains,
-    )
+    truth: dict[str, Any] = {"losses": varied.losses, "coil_gains": varied.coil_gains}
+    loop = LyingLoop(setup, rig, PathControl(setup), seed, **truth)
     loop.liar = Liar(kind, begin, random)
     world, kinematics, latch = World(setup.scene), setup.coils.needle().kinematics, loop.bridge.latch
     middles, clearances, stopped, travel = list[Vector](), list[float](), math.nan, math.nan
@@ -172,30 +169,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Run all lies; return the figures, and whether every one but an honest tracker's ended in a fault."""
     setups, lies = options.setup or SETUPS, options.lie or LIES
     with ProcessPoolExecutor(options.workers) as pool:
         runs = list(pool.map(run_lie, product(setups, lies, range(options.seeds))))
+    lied = [run for run in runs if not run["stopped_before"]]
+    columns = {"lie": "{lie}", "latched": "{latched}/{runs}", "after [s]": "{after}", "travel [mm]": "{travel}"}
+    columns |= {"speed": "{speed:.2f}", "broken": "{broken}"}
+    caption = (
+        "s, mm: until the fault is latched, time and true travel, median (maximum); broken: keep_out, by lies that "
+        f"began {1e3 * CLEAR:g} mm from a shape; {len(runs) - len(lied)} of {len(runs)} runs stopped before their lie"
+    )
     for name in setups:
-        table = Table(title=f"{name}: lies about the needle's pose, simulated")
-        for column in ("lie", "latched", "after [s]", "travel [mm]", "speed", "broken"):
-            table.add_column(column, justify="left" if column == "lie" else "right", no_wrap=True)
-        for kind in lies:
-            found = [r for r in runs if (r["setup"], r["lie"]) == (name, kind) and not r["stopped_before"]]
-            latched = [r for r in found if r["stopped_s"] is not None]
-            after, travel = [r["stopped_s"] for r in latched], [1e3 * r["travel_m"] for r in latched]
-            shown = [f"{np.median(values):.2f} ({max(values):.2f})" if values else "-" for values in (after, travel)]
-            speed = max((r["peak_speed_ratio"] for r in found), default=0.0)
-            broken = sum(r["broken"] for r in found)
-            table.add_row(kind, f"{len(latched)}/{len(found)}", *shown, f"{speed:.2f}", str(broken))
-        console.print(table)
-    before = sum(bool(r["stopped_before"]) for r in runs)
-    console.print(
-        "s, mm: until the fault is latched, time and true travel, median (maximum); broken: keep_out, by lies that"
-    )
-    console.print(
-        f"began {1e3 * CLEAR:g} mm from a shape. {before} of {len(runs)} runs stopped before their lie began."
-    )
-    told = [r for r in runs if not r["stopped_before"]]
-    return {"runs": runs}, all((r["stopped_s"] is None) == (r["lie"] == "none") for r in told)
+        rows = [_row(kind, [run for run in lied if (run["setup"], run["lie"]) == (name, kind)]) for kind in lies]
+        terminal.print(figures_table(f"{name}: lies about the needle's pose, simulated", rows, columns, caption))
+    return {"runs": runs}, all((run["stopped_s"] is None) == (run["lie"] == "none") for run in lied)
+
+
+def _row(kind: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of a lie's runs."""
+    latched = [run for run in runs if run["stopped_s"] is not None]
+    values = {"after": [run["stopped_s"] for run in latched], "travel": [1e3 * run["travel_m"] for run in latched]}
+    shown = {name: f"{np.median(times):.2f} ({max(times):.2f})" if times else "-" for name, times in values.items()}
+    speed = max((run["peak_speed_ratio"] for run in runs), default=0.0)
+    counts = {"latched": len(latched), "runs": len(runs), "broken": sum(run["broken"] for run in runs)}
+    return {"lie": kind, **shown, "speed": speed, **counts}

@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,10 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.table import Table
 
-from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
+from benchmarks.report import figures_table
+from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.configuration import read_yaml
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
@@ -39,20 +38,16 @@ if TYPE_CHECKING:
 
 SETUP, SEGMENTS, FRAME_RATE = "petri_35mm_polyamide", 81, 30.0  # the latter in place of the setup's own
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-WIDTH, HEIGHT = 1366, 768  # of the page [px]
 TIMEOUT = 240.0  # s for the graph to be there; the first start on a machine compiles
 GRACE = 60.0  # s for the command to end
-HELD, RELEASED = 0.25, 0.35  # s that a key is held, and not held, on average
 KEYS = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"))  # by axis; the second where the tip is beyond 0
 STATIONS = {OPERATOR_COMMAND: "the page's command in the graph", NEEDLE_SETPOINT: "the filtered velocity at the bridge"}
-MAX_DELAY = 0.05  # s from a key press to the filtered velocity at the bridge, at the 99th percentile
-LOST = 1.0  # s after a key press, after which no velocity counts as its answer
 LISTEN = """() => { window.bench_keys = []; addEventListener('keydown', (event) => {
     if (!event.repeat) window.bench_keys.push(performance.timeOrigin + event.timeStamp); }, true); }"""
 
 
 def key_delays(station: str, keys: Sequence[float], moving: Sequence[float]) -> dict[str, Any]:
-    """Return the times from each key press to the first velocity after it: median, p99 and greatest [s].
+    """Return the times from each key press to the first velocity after it: median, p99 and greatest [ms].
 
     `count` is of those that were answered, `lost` of the others.
 
@@ -62,9 +57,10 @@ def key_delays(station: str, keys: Sequence[float], moving: Sequence[float]) -> 
         moving: when a velocity that is not zero came, rising [s]; at least one within a second of a key.
     """
     delays = np.append(moving, np.inf)[np.searchsorted(moving, keys)] - np.asarray(keys)
-    found = delays[delays < LOST]
-    figures = dict(zip(("median", "p99", "greatest"), np.percentile(found, [50.0, 99.0, 100.0]).tolist(), strict=True))
-    return {"station": station, "count": len(found), "lost": len(keys) - len(found), **figures}
+    answered = 1e3 * delays[delays < 1.0]  # s; after which no velocity counts as its answer
+    median, p99, greatest = np.percentile(answered, [50.0, 99.0, 100.0]).tolist()
+    figures = {"station": station, "count": len(answered), "lost": len(keys) - len(answered)}
+    return {**figures, "median": median, "p99": p99, "greatest": greatest}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -72,26 +68,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--presses", type=whole_number, default=200, metavar="N", help="of a key (default: 200)")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Time the page; return the figures."""
-    log = make_log(console)
+    log = terminal.log
     log(f"starting {SETUP} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
-    with progress(console, "page") as advance:
+    with terminal.progress("page") as advance:
         delays, rates = _measure(options.presses, advance)
-    console.print(page_table(delays))
-    log(f"limit: {1e3 * MAX_DELAY:g} ms at the bridge, 99th percentile; {FRAME_RATE:g} pictures a second")
+    columns = {"": "{station}", **{name: f"{{{name}:.1f}}" for name in ("median", "p99", "greatest")}}
+    columns |= {"keys": "{count}", "lost": "{lost}"}
+    title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
+    terminal.print(figures_table(title, delays, columns))
+    log(f"limit: 50 ms at the bridge, 99th percentile; {FRAME_RATE:g} pictures a second")
     log("the page drew {drawn:.1f} pictures a second, of {states:.1f} states and {frames:.1f} frames".format(**rates))
     return {"scenario": SETUP, "segments": SEGMENTS, "delays": delays, **rates}, True
-
-
-def page_table(delays: Sequence[dict[str, Any]]) -> Table:
-    """Return the figures as a table that fits 80 columns."""
-    rows = []
-    for each in delays:
-        values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest"))
-        rows.append((each["station"], *values, str(each["count"]), str(each["lost"])))
-    title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
-    return make_table(title, ("", "median", "p99", "maximum", "keys", "lost"), rows)
 
 
 def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], dict[str, float]]:
@@ -101,17 +90,23 @@ def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict
         ConfigurationError: the browser, or what drives it, is not installed.
         GraphError: the graph does not start, or moves nothing.
     """
-    with _serving() as server:
+    content = read_yaml(read_setup(SETUP).path, "setup file")
+    content["/**/thread_model"]["ros__parameters"]["segments"] = SEGMENTS
+    content["/**/rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        path = Path(folder) / f"{SETUP}.yaml"
+        path.write_text(yaml.safe_dump(content), encoding="utf-8")
+        server = stack.enter_context(running_console(str(path)))
         domain, url = int(server.find(r"ROS domain (\d+)")), server.find(r"open (http\S+)")
         server.find(r"(runs; the coils)")
-        with _page(url) as page, _sent(domain) as sent:
-            for button in ("#control", "#arm"):
-                page.locator(f"{button}:enabled").click(timeout=1e3 * TIMEOUT)
-            page.evaluate(LISTEN)
-            began, before = time.monotonic(), dict(page.evaluate("() => ({ ...window.console_stats })"))
-            _press(page, presses, progress)
-            after, took = dict(page.evaluate("() => ({ ...window.console_stats })")), time.monotonic() - began
-            keys = [float(stamp) * 1e-3 for stamp in page.evaluate("() => window.bench_keys")]
+        page, sent = stack.enter_context(_page(url)), stack.enter_context(_sent(domain))
+        for button in ("#control", "#arm"):
+            page.locator(f"{button}:enabled").click(timeout=1e3 * TIMEOUT)
+        page.evaluate(LISTEN)
+        began, before = time.monotonic(), dict(page.evaluate("() => ({ ...window.console_stats })"))
+        _press(page, presses, progress)
+        after, took = dict(page.evaluate("() => ({ ...window.console_stats })")), time.monotonic() - began
+        keys = [float(stamp) * 1e-3 for stamp in page.evaluate("() => window.bench_keys")]
     if not all(sent.values()):
         raise GraphError("no key moved the needle")
     delays = [key_delays(words, keys, sent[channel.recorded]) for channel, words in STATIONS.items()]
@@ -133,8 +128,8 @@ class RunningConsole:
         """
         deadline = time.monotonic() + TIMEOUT
         while time.monotonic() < deadline and self.process.poll() is None:
-            if found := re.search(pattern, self.output.read_text(), re.MULTILINE):
-                return found[1]
+            if match := re.search(pattern, self.output.read_text(), re.MULTILINE):
+                return match[1]
             time.sleep(0.02)
         raise GraphError(f"the console ended, or shows no {pattern} after {TIMEOUT:g} s: {self.output.read_text()}")
 
@@ -152,29 +147,16 @@ class RunningConsole:
 def running_console(*arguments: str, **environment: str) -> Iterator[RunningConsole]:
     """Run the command on a free port; end it at the end if it has not."""
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
-    own = {**os.environ, **environment}
+    env = {**os.environ, **environment}
     with TemporaryDirectory() as folder, Path(folder, "output").open("wb") as file:
         # In a session of its own: Ctrl-C at a terminal is not for it.
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=own, start_new_session=True)
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=env, start_new_session=True)
         console = RunningConsole(process, Path(file.name))
         try:
             yield console
         finally:
             if console.process.poll() is None:
                 console.end()
-
-
-@contextmanager
-def _serving() -> Iterator[RunningConsole]:
-    """Run the command with the setup that is measured."""
-    content = read_yaml(read_setup(SETUP).path, "setup file")
-    content["/**/thread_model"]["ros__parameters"]["segments"] = SEGMENTS
-    content["/**/rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / f"{SETUP}.yaml"
-        path.write_text(yaml.safe_dump(content), encoding="utf-8")
-        with running_console(str(path)) as console:
-            yield console
 
 
 def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
@@ -187,9 +169,9 @@ def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
         tip = [float(entry) for entry in (page.get_attribute("#dish", "data-tip") or "0,0").split(",")]
         key = KEYS[done % 2][int(tip[done % 2] > 0.0)]
         page.keyboard.down(key)
-        time.sleep(HELD * chance.uniform(0.8, 1.2))
+        time.sleep(0.25 * chance.uniform(0.8, 1.2))
         page.keyboard.up(key)
-        time.sleep(RELEASED * chance.uniform(0.8, 1.2))
+        time.sleep(0.35 * chance.uniform(0.8, 1.2))
         progress((done + 1) / presses)
 
 
@@ -207,7 +189,7 @@ def _page(url: str) -> Iterator[Page]:
     with sync_playwright() as playwright:
         started = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
         try:
-            page = started.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            page = started.new_page(viewport={"width": 1366, "height": 768})
             page.goto(url)
             yield page
         finally:
@@ -243,13 +225,13 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
         while not over.is_set():
             recorder.spin(0.05)
 
-    thread = threading.Thread(target=listen)
-    thread.start()
+    listener = threading.Thread(target=listen)
+    listener.start()
     try:
         yield times
     finally:
         over.set()
-        thread.join()
+        listener.join()
         recorder.close()
-        for found in times.values():
-            found.sort()
+        for stamps in times.values():
+            stamps.sort()

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sphinx.pycode import ModuleAnalyzer
+
 import magnetosuture_thread
 from magnetosuture_thread import MATERIALS
 from magnetosuture_thread.cli import make_parser
@@ -22,6 +24,10 @@ ROOT = Path(__file__).parents[1]
 NODES = ROOT / "magnetosuture_thread" / "nodes"
 DEFINITIONS = ROOT / "msg_defs"
 CHANNELS = {name: value for name, value in vars(interface).items() if isinstance(value, interface.Channel)}
+COMMENTS = {
+    names: " ".join(lines).strip()
+    for names, lines in ModuleAnalyzer.for_module(interface.__name__).find_attr_docs().items()
+}
 _BLOCK = re.compile(r"^```\{generated\} (\w+)\n```$", re.MULTILINE)
 
 
@@ -88,7 +94,7 @@ def topics() -> str:
         return ", ".join(code(node) for node, used in traffic.items() if name in used[way])
 
     rows = (
-        (f"{_topic_name(name, each)}<br>{_type(each.type_name)}", each.about, users(name, 0), users(name, 1))
+        (f"{_topic_name(name, each)}<br>{_type(each.type_name)}", COMMENTS["", name], users(name, 0), users(name, 1))
         for name, each in CHANNELS.items()
     )
     return table("topic, type|content|published by|received by", rows)
@@ -158,7 +164,8 @@ def _modules_of(node: str) -> set[Path]:
 def services() -> str:
     """Return a table of all services."""
     rows = (
-        (code(name), _type(each.type_name), code(each.node), each.about) for name, each in interface.SERVICES.items()
+        (code(each.value), _type(each.type_name), code(each.node), COMMENTS["Service", each.name])
+        for each in interface.Service
     )
     return table("service|type|node|what it does", rows)
 

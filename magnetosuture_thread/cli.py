@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
-from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe, make_console
+from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe
 from magnetosuture_thread.settings.errors import missing_module
 
 DESCRIPTION = """\
@@ -19,7 +19,8 @@ Predicts where a suture thread goes behind a magnetically steered needle.
 
 Research software, no medical device. Lengths are in metres and times in seconds throughout.
 """
-# Name and summary of each command. `commands/NAME.py` is imported when the command is given, so that --help is quick.
+# Name and summary of each command. The file of `commands` is imported when the command is given, so that --help is
+# quick; what it does after a hyphen is `add_...` in that file.
 COMMANDS = {
     "replay": "play a recorded bag through the live graph, or offline",
     "render": "write a bag of simulated camera frames, or poses",
@@ -53,20 +54,22 @@ def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentPa
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, summary in COMMANDS.items():
-        own = subparsers.add_parser(name, help=summary)
+        subparser = subparsers.add_parser(name, help=summary)
         if name in names:
-            import_module(f"magnetosuture_thread.commands.{name.replace('-', '_')}").add(own)
+            verb, _, kind = name.partition("-")
+            module = import_module(f"magnetosuture_thread.commands.{verb}")
+            getattr(module, f"add_{kind}" if kind else "add")(subparser)
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
 
     def run() -> int:
         # A command draws into files. What a notebook asks of its own kernel may not be importable here.
         os.environ["MPLBACKEND"] = "agg"
-        options = make_parser(given[:1]).parse_args(given)
+        options = make_parser(words[:1]).parse_args(words)
         check_outputs(options)
         return int(options.run(options, Terminal()))
 
@@ -90,7 +93,7 @@ def exit_code(run: Callable[[], int]) -> int:
 
 
 def _fail(problem: str, code: int) -> int:
-    errors = make_console(errors=True)
+    errors = Terminal(errors=True)
     errors.print("error:", style="bold red", end=" ")
     errors.print(" ".join(problem.split()), markup=False)
     return code

@@ -11,7 +11,7 @@ import pytest
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.parameter_files import load_setup
+from magnetosuture_thread.settings.shared_parameters import load_setup
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ not leave this machine. No node may end or be silent for more than 0.5 s, and th
 from __future__ import annotations
 
 import argparse
+import random
 from typing import Any
 
-from rich.console import Console
-
-from magnetosuture_thread.commands.command import count_argument, make_log, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, count_argument, whole_number
 
 TARGETS = ("bags", "nodes")
 MAX_LINES = 20  # on broken promises that are shown; `--json` writes all
@@ -30,18 +29,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=whole_number, default=1, metavar="S", help="of the variation (default: 1)")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Attack; return the figures and whether all promises were kept."""
-    with progress(console, f"attack {options.target}") as advance:
+    with terminal.progress(f"attack {options.target}") as advance:
         if options.target == "bags":
             from benchmarks.attack.bags import attack_bags
 
             figures, lines = attack_bags(options.count, options.seed, advance)
         else:
-            from benchmarks.attack.nodes import attack_nodes  # needs ROS
+            from benchmarks.attack.nodes import Attack  # needs ROS
 
-            figures, lines = attack_nodes(options.count, options.seed, advance)
+            attack, with_clock = Attack(options.count, advance), round(0.25 * options.count)
+            # First by the time of the day, then by a simulated clock.
+            for number, clock in ((options.count - with_clock, False), (with_clock, True)):
+                if number:
+                    attack.attack(number, random.Random(f"{options.seed} {clock}"), clock)
+            figures, lines = attack.figures()
     for line in (*lines, *figures["broken"][:MAX_LINES]):
-        make_log(console)(line)
-    about = {"target": options.target, "count": options.count, "seed": options.seed}
-    return {**about, **figures}, not figures["broken"]
+        terminal.log(line)
+    chosen = {"target": options.target, "count": options.count, "seed": options.seed}
+    return {**chosen, **figures}, not figures["broken"]

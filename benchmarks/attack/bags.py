@@ -12,6 +12,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,9 +30,6 @@ from magnetosuture_thread.settings.errors import MagnetosutureError
 
 MAX_SECONDS, MAX_MEGABYTES = 5.0, 300.0
 GRACE = 10.0  # s after `MAX_SECONDS`, after which a reader is ended
-MESSAGES_EACH = 500  # of each topic
-PERIOD = 33_000_000  # ns between two messages of a topic
-SECOND = 10**9
 KINDS = ("flip", "zeros", "noise", "cut", "remove", "repeat", "swap")
 OUTCOMES = ("whole", "damage_noticed", "refused", "altered_and_unchecked", "ended")
 PROMISES = ("altered_as_sound", "silently_lost", "tracebacks", "too_slow", "too_large")
@@ -55,67 +53,57 @@ def attack_bags(count: int, seed: int, progress: Callable[[float], None]) -> tup
     Returns:
         Figures by format, with what was broken, and lines for a person.
     """
-    figures: dict[str, Any] = {}
-    broken: list[str] = []
+    totals: dict[str, Counter[str]] = {"mcap": Counter(), "sqlite3": Counter()}
+    worst, broken, original = dict.fromkeys(totals, (0.0, 0.0)), list[str](), Counter(original_messages())
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        bags = {"mcap": _write_mcap(folder / "mcap"), "sqlite3": _write_sqlite(folder / "sqlite3")}
-        original = Counter(original_messages())
-        totals = {name: Counter[str]() for name in bags}
-        worst = dict.fromkeys(bags, (0.0, 0.0))
+        for name in totals:
+            _write_bag(folder / name, name)
         for index in range(count):
-            name = list(bags)[index % len(bags)]
-            target = folder / "damaged"
-            kinds = _damaged_copy(bags[name], target, random.Random(f"{seed} {index}"))
-            found, seconds, megabytes = check_bag(target, original)
-            found["too_slow"] += seconds > MAX_SECONDS
-            found["too_large"] += megabytes > MAX_MEGABYTES
-            totals[name] += found
+            name, target = list(totals)[index % len(totals)], folder / "damaged"
+            kinds = _damaged_copy(folder / name, target, random.Random(f"{seed} {index}"))
+            outcome, seconds, megabytes = check_bag(target, original)
+            outcome["too_slow"] += seconds > MAX_SECONDS
+            outcome["too_large"] += megabytes > MAX_MEGABYTES
+            totals[name] += outcome
             worst[name] = max(worst[name][0], seconds), max(worst[name][1], megabytes)
-            broken += [f"{name}, attack {index} ({kinds}): {promise}" for promise in PROMISES if found[promise]]
+            broken += [f"{name}, attack {index} ({kinds}): {promise}" for promise in PROMISES if outcome[promise]]
             progress((index + 1) / count)
-    lines = []
+    figures, lines = dict[str, Any](), list[str]()
     for name, total in totals.items():
-        seconds, megabytes = worst[name]
-        number = sum(total[key] for key in OUTCOMES)
-        figures[name] = {key: total[key] for key in (*OUTCOMES, *PROMISES)}
-        figures[name] |= {"bags": number, "max_s": seconds, "max_mb": megabytes}
-        shown = ", ".join(f"{total[key]} {key.replace('_', ' ')}" for key in (*OUTCOMES, *PROMISES))
-        lines.append(f"{name}: {number} bags: {shown}; at most {seconds:.1f} s and {megabytes:.0f} MB")
+        counts, (seconds, megabytes) = {key: total[key] for key in (*OUTCOMES, *PROMISES)}, worst[name]
+        bags = sum(total[key] for key in OUTCOMES)
+        figures[name] = {**counts, "bags": bags, "max_s": seconds, "max_mb": megabytes}
+        shown = ", ".join(f"{number} {key.replace('_', ' ')}" for key, number in counts.items())
+        lines.append(f"{name}: {bags} bags: {shown}; at most {seconds:.1f} s and {megabytes:.0f} MB")
     return {**figures, "broken": broken}, lines
 
 
 def original_messages() -> list[Message]:
     """Return the messages of a bag: a needle that moves, its thread, and texts."""
-    found: list[Message] = []
-    for index in range(MESSAGES_EACH):
-        at = SECOND + index * PERIOD
+    result: list[Message] = []
+    for index in range(500):
+        at = 10**9 + index * 33_000_000  # ns
         along = np.linspace(0.0, 0.015, 12)
         points = np.stack([along, 0.002 * np.sin(300.0 * along + 0.05 * index)], axis=1)
-        messages = (
-            packed_path(at, points),
-            packed_pose(at, points[0], np.array([1.0, 0.0])),
-            pack("text", f"note {index}"),
-        )
-        found += [(topic, at, data) for topic, data in zip(TYPES, messages, strict=True)]
-    return found
+        pose, note = packed_pose(at, points[0], np.array([1.0, 0.0])), pack("text", f"note {index}")
+        messages = zip(TYPES, (packed_path(at, points), pose, note), strict=True)
+        result += [(topic, at, data) for topic, data in messages]
+    return result
 
 
-def _write_mcap(folder: Path) -> Path:
-    with BagWriter(folder, {"simulated": "all of it"}) as bag:
-        for topic, kind in TYPES.items():
-            bag.add_topic(topic, kind)
+def _write_bag(folder: Path, storage: str) -> None:
+    if storage == "mcap":
+        with BagWriter(folder, {"simulated": "all of it"}) as bag:
+            for topic, kind in TYPES.items():
+                bag.add_topic(topic, kind)
+            for message in original_messages():
+                bag.write(*message)
+        return
+    with RosbagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as rosbag:
+        topics = {topic: rosbag.add_connection(topic, kind, typestore=typestore()) for topic, kind in TYPES.items()}
         for topic, at, data in original_messages():
-            bag.write(topic, at, data)
-    return folder
-
-
-def _write_sqlite(folder: Path) -> Path:
-    with RosbagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as bag:
-        own = {topic: bag.add_connection(topic, kind, typestore=typestore()) for topic, kind in TYPES.items()}
-        for topic, at, data in original_messages():
-            bag.write(own[topic], at, data)
-    return folder
+            rosbag.write(topics[topic], at, data)
 
 
 def _damaged_copy(bag: Path, target: Path, chance: random.Random) -> str:
@@ -183,37 +171,34 @@ def check_bag(bag: Path, original: Counter[Message]) -> tuple[Counter[str], floa
     if not is_ready:
         os.kill(child, signal.SIGKILL)
     _, _, usage = os.wait4(child, 0)
-    found: Counter[str] = Counter(json.loads(answer)) if answer else Counter(ended=1, tracebacks=int(bool(is_ready)))
-    return found, time.monotonic() - began, usage.ru_maxrss / 1024.0
+    outcome: Counter[str] = Counter(json.loads(answer)) if answer else Counter(ended=1, tracebacks=int(bool(is_ready)))
+    return outcome, time.monotonic() - began, usage.ru_maxrss / 1024.0
 
 
 def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
     """Return what reading and repairing make of a bag."""
-    found: Counter[str] = Counter()
-    try:
-        opened = Bag(bag)
-    except MagnetosutureError:
-        return {"refused": 1}
     refused: Counter[str] = Counter()
     try:
-        read = Counter((record.topic, record.time, record.data) for _, record in opened.every_record(refused))
+        opened = Bag(bag)
+        read = _messages(opened, refused)
     except MagnetosutureError:
         return {"refused": 1}
     altered, missing = (read - original).total(), (original - read).total()
     is_noticed = opened.damage is not None or bool(refused)
     is_doubted = is_noticed or bool(opened.has_no_checksum)
-    found["damage_noticed" if is_noticed else "altered_and_unchecked" if altered or missing else "whole"] = 1
+    outcome = {"damage_noticed" if is_noticed else "altered_and_unchecked" if altered or missing else "whole": 1}
     # Of a message that was altered unnoticed the original is missing, and the altered one is there in its place.
-    found["silently_lost"] += missing > altered and not is_noticed
-    found["altered_as_sound"] += altered > 0 and (not is_doubted or is_noticed)
+    outcome["silently_lost"] = int(missing > altered and not is_noticed)
+    outcome["altered_as_sound"] = int(altered > 0 and (not is_doubted or is_noticed))
     output = bag.with_name("repaired")
     shutil.rmtree(output, ignore_errors=True)
-    try:
+    with suppress(MagnetosutureError):
         write_repaired_bag(opened, output, "repaired")
         new = Bag(output)
-    except MagnetosutureError:
-        return dict(found)
-    made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
-    is_marked = bool(new.has_no_checksum) and not is_noticed
-    found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
-    return dict(found)
+        is_marked = bool(new.has_no_checksum) and not is_noticed
+        outcome["altered_as_sound"] += (_messages(new, Counter()) - original).total() > 0 and not is_marked
+    return outcome
+
+
+def _messages(bag: Bag, refused: Counter[str]) -> Counter[Message]:
+    return Counter((record.topic, record.time, record.data) for _, record in bag.every_record(refused))

@@ -108,8 +108,8 @@ class Attacker:
         if (subscription := self._subscriptions.get(name)) is None:
             return b""
         with subscription.handle:
-            while (found := subscription.handle.take_message(subscription.msg_type, True)) is not None:
-                if hash(data := bytes(found[0])) not in self._own:
+            while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                if hash(data := bytes(taken[0])) not in self._own:
                     self._seen[name] = data
         return self._seen.get(name, b"")
 
@@ -162,10 +162,10 @@ class Attacker:
 
     def _value(self, kind: str) -> Any:
         """Return a value of a field's type."""
-        if found := _SEQUENCE.match(kind):
-            most = int(found["bound"] or 1 << 30)
-            count = int(found["count"]) if found["count"] else min(self._chance.choice(LENGTHS), most)
-            return [self._value(found["kind"] or found["element"]) for _ in range(count)]
+        if match := _SEQUENCE.match(kind):
+            most = int(match["bound"] or 1 << 30)
+            count = int(match["count"]) if match["count"] else min(self._chance.choice(LENGTHS), most)
+            return [self._value(match["kind"] or match["element"]) for _ in range(count)]
         if kind.startswith(("string", "wstring")):
             text = self._chance.choice(TEXTS) * self._chance.choice((1, 1, 1, 500))
             bound = re.search(r"<(\d+)>", kind)

@@ -26,56 +26,40 @@ TARGETS = (SCENE_SERVER, *RIG_NODES, *NODES)
 CONSOLE = "console"  # which gets hostile messages, but no requests
 MAX_DELAY, MAX_STOP_DELAY = 0.5, 0.2  # s
 RATE = 150.0  # attacks a second
-CLOCK_SHARE = 0.25  # of all attacks, on a graph with a simulated clock
 DISCOVERY_TIME = 8.0  # s for the services of all nodes, then for its clients: an answer to an unknown client is lost
 LAST_ANSWERS = 20.0  # s for what is still unanswered
 
 
-def attack_nodes(count: int, seed: int, progress: Callable[[float], None]) -> tuple[dict[str, Any], list[str]]:
-    """Attack all nodes, first by the time of the day, then by a simulated clock.
+class Attack:
+    """Counts of all attacks, and delays of all answers [s] by the node's name, or `STOP`.
 
     Args:
         count: of hostile requests, messages and times.
-        seed: of the variation.
         progress: called with the share done, 0 to 1.
-
-    Returns:
-        Figures, with what was broken, and lines for a person.
     """
-    attack = _Attack(count, progress)
-    with_clock = round(CLOCK_SHARE * count)
-    for number, clock in ((count - with_clock, False), (with_clock, True)):
-        if number:
-            attack.attack(number, random.Random(f"{seed} {clock}"), clock)
-    return attack.figures()
-
-
-class _Attack:
-    """Counts of all attacks, and delays of all answers [s] by the node's name, or `STOP`."""
 
     def __init__(self, count: int, progress: Callable[[float], None]) -> None:
-        self.sent, self.events = Counter[str](), Counter[str]()
-        self.delays = defaultdict[str, list[float]](list)
-        self.broken: list[str] = []
+        self._sent, self._events = Counter[str](), Counter[str]()
+        self._delays = defaultdict[str, list[float]](list)
+        self._broken: list[str] = []
         self._count, self._progress = count, progress
 
     def figures(self) -> tuple[dict[str, Any], list[str]]:
         """Return the figures, with what was broken, and lines for a person."""
-        counts, sent = {name: self.events[name] for name in ("ended", "unanswered", UNARMED)}, dict(self.sent)
-        words = ", ".join(f"{number} {kind}" for kind, number in sent.items())
+        counts, answers = {name: self._events[name] for name in ("ended", "unanswered", UNARMED)}, {}
+        words = ", ".join(f"{number} {kind}" for kind, number in self._sent.items())
         lines = [f"{words}: {counts['ended']} nodes ended, {counts['unanswered']} requests without an answer"]
-        answers = {}
-        for name, each in sorted(self.delays.items()):
-            median, p99, largest = (float(1e3 * value) for value in np.quantile(each, (0.5, 0.99, 1.0)))
-            answers[name] = {"count": len(each), "median_ms": median, "p99_ms": p99, "max_ms": largest}
-            lines.append(f"{name}: {len(each)} answers, median {median:.1f} ms, at most {largest:.1f} ms")
+        for name, delays in sorted(self._delays.items()):
+            median, p99, largest = (float(1e3 * value) for value in np.quantile(delays, (0.5, 0.99, 1.0)))
+            answers[name] = {"count": len(delays), "median_ms": median, "p99_ms": p99, "max_ms": largest}
+            lines.append(f"{name}: {len(delays)} answers, median {median:.1f} ms, at most {largest:.1f} ms")
             limit = MAX_STOP_DELAY if name == STOP else MAX_DELAY
-            if late := sum(delay > limit for delay in each):
-                took = f"took longer than {limit:g} s, at most {max(each):.2f} s"
-                self.broken.append(f"{name}: {late} of {len(each)} answers {took}")
-        if not self.delays[STOP]:
-            self.broken.append("no emergency stop was answered")
-        return {"sent": sent, **counts, "answers": answers, "broken": self.broken}, lines
+            if late := sum(delay > limit for delay in delays):
+                took = f"took longer than {limit:g} s, at most {max(delays):.2f} s"
+                self._broken.append(f"{name}: {late} of {len(delays)} answers {took}")
+        if not self._delays[STOP]:
+            self._broken.append("no emergency stop was answered")
+        return {"sent": dict(self._sent), **counts, "answers": answers, "broken": self._broken}, lines
 
     def attack(self, count: int, chance: random.Random, clock: bool) -> None:
         """Attack a graph of its own."""
@@ -94,8 +78,8 @@ class _Attack:
             for line in (logs / "probe.log").read_text().splitlines():
                 name, _, delay = line.partition(" ")
                 if delay and name in (STOP, CONSOLE, *TARGETS):
-                    self.delays[name].append(float(delay))
-                self.events[UNARMED] += line == UNARMED
+                    self._delays[name].append(float(delay))
+                self._events[UNARMED] += line == UNARMED
 
     def _attack(self, graph: OwnGraph, logs: Path, count: int, chance: random.Random, clock: bool) -> None:
         context, options = Context(), {"start_parameter_services": False}
@@ -112,21 +96,21 @@ class _Attack:
             began = time.monotonic()
             for index in range(count):
                 attacker.attack()
-                self._progress((sum(self.sent.values()) + index + 1) / self._count)
+                self._progress((sum(self._sent.values()) + index + 1) / self._count)
                 for name in (CONSOLE, *TARGETS):
                     if graph.nodes.ended(name):
                         last = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()[-1:]
-                        self.broken.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
-                        self.events["ended"] += 1
+                        self._broken.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
+                        self._events["ended"] += 1
                         graph.nodes.start(name)
                 _spin(executor, began + (index + 1) / RATE - time.monotonic())
             until = time.monotonic() + LAST_ANSWERS
             while attacker.unanswered and time.monotonic() < until:
                 _spin(executor, 0.1)
-            self.events["unanswered"] += len(attacker.unanswered)
+            self._events["unanswered"] += len(attacker.unanswered)
             for service, number in Counter(attacker.unanswered.values()).items():
-                self.broken.append(f"{service}: {number} requests were not answered")
-            self.sent.update(attacker.sent)
+                self._broken.append(f"{service}: {number} requests were not answered")
+            self._sent.update(attacker.sent)
         finally:
             executor.shutdown()
             listener.destroy_node()

@@ -31,20 +31,15 @@ from magnetosuture_thread.rig.camera import STEEL_BGR, Cover, Lighting
 Random = np.random.Generator
 MakeCase = Callable[[Random], Case]
 
-WITHIN, THREAD_WITHIN = 0.0150, 0.0163  # m; of the dish's centre, in which a needle and a thread lie
+WITHIN = 0.0150  # m; of the dish's centre, in which a needle lies
 CURVATURES = (-190.0, 0.0, 0.0, 0.0, 110.0, 190.0)  # 1/m
 TURN_STEP = 0.05e-3  # m; between vertices of a thread
 MAX_TRIES = 2000
 FOLDS = ((0, 4), (4, 15), (15, 26), (26, 50))  # degrees from the heading
 SIZES = {320: (320, 240), 640: (640, 480), 1280: (1280, 960), 1920: (1920, 1080)}
-COLOURS = {
-    "black": (38.0, 34.0, 34.0),
-    "violet": (132.0, 78.0, 100.0),
-}
+COLOURS = {"black": (38.0, 34.0, 34.0), "violet": (132.0, 78.0, 100.0)}
 WIDTHS_PX = (0.5, 1.0, 2.0, 4.0, 6.0)
-COVERS = (1.5, 3.0, 6.0, 10.0)  # mm
 COVER_BGR = ((168.0, 176.0, 205.0), (60.0, 58.0, 55.0), (210.0, 205.0, 200.0))
-SKIN_BGR, INSTRUMENT_BGR, GLARE_BGR = (150.0, 170.0, 225.0), (120.0, 118.0, 115.0), (262.0, 262.0, 262.0)
 CLEARANCE = 1.2e-3  # m; of covers and of another thread from the needle and the thread's beginning
 TURNS = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
 BESIDE = (0.6e-3, 2.0e-3)  # m; from a thread to one that comes near without a crossing
@@ -53,9 +48,9 @@ BESIDE = (0.6e-3, 2.0e-3)  # m; from a thread to one that comes near without a c
 def tried(make: Callable[..., Case | None]) -> Callable[..., Case]:
     """Return a function that draws a case at random, again and again until one fits into the dish."""
 
-    def draw(*given: Any, **options: Any) -> Case:
+    def draw(*arguments: Any, **options: Any) -> Case:
         for _ in range(MAX_TRIES):
-            if (case := make(*given, **options)) is not None:
+            if (case := make(*arguments, **options)) is not None:
                 return case
         raise RuntimeError(f"no case of {make.__name__} fits into the dish")
 
@@ -69,13 +64,9 @@ def unit_vector(angle: float) -> Points:
 
 def random_lighting(random: Random) -> Lighting:
     """Return lighting and noise of a usual laboratory."""
-    return Lighting(
-        gain=random.uniform(0.7, 1.05),
-        slope=random.uniform(0.0, 3.0),
-        glare=random.uniform(0.0, 1.0),
-        noise=random.uniform(0.5, 2.0),
-        blur_px=random.uniform(0.6, 1.0),
-    )
+    ranges = {"gain": (0.7, 1.05), "slope": (0.0, 3.0), "glare": (0.0, 1.0), "noise": (0.5, 2.0), "blur_px": (0.6, 1.0)}
+    values: dict[str, Any] = {name: random.uniform(*bounds) for name, bounds in ranges.items()}
+    return Lighting(**values)
 
 
 def random_needle(random: Random, length: float = 0.007, within: float = WITHIN, width: float = 0.0004) -> Needle:
@@ -96,23 +87,33 @@ def winding_line(random: Random, start: Points, angle: float, length: float, ben
     return np.vstack([start, start + walked])
 
 
+def continued(random: Random, line: Points, length: float, bends: float = 250.0) -> Points:
+    """Return a line that goes on from its end as `winding_line`, for so long [m]."""
+    angle = math.atan2(*(line[-1] - line[-2])[::-1])
+    return np.vstack([line, winding_line(random, line[-1], angle, length, bends)[1:]])
+
+
 def is_inside(thread: Points) -> bool:
-    """Say whether a line stays off the wall."""
-    return bool(np.linalg.norm(thread, axis=1).max() < THREAD_WITHIN)
+    """Return whether a line stays off the wall."""
+    return bool(np.linalg.norm(thread, axis=1).max() < 0.0163)
 
 
-def _is_clear(needle: Needle, thread: Points, first: float = 2e-3, clearance: float = 1.2e-3) -> bool:
-    """Say whether a thread stays off its needle but for where it leaves."""
-    later = thread[arc_lengths(thread) > first]
-    return bool(needle.distances(later[::4]).min() > clearance)
+def _is_clear(needle: Needle, thread: Points) -> bool:
+    """Return whether a thread stays off its needle but for where it leaves."""
+    later = thread[arc_lengths(thread) > 2e-3]
+    return bool(needle.distances(later[::4]).min() > CLEARANCE)
 
 
 def _crosses_itself(thread: Points) -> bool:
-    """Say whether a thread crosses itself at a good angle, or comes near to itself."""
+    """Return whether a thread crosses itself at a good angle, or comes near to itself."""
     line = thread[::6]
     apart = np.linalg.norm(line[:, None] - line[None], axis=2)
     near = np.abs(np.subtract.outer(np.arange(len(line)), np.arange(len(line)))) * 6 * TURN_STEP > 2.5e-3
     return bool((apart[near] < 0.7e-3).any())
+
+
+def _is_simple(needle: Needle, line: Points) -> bool:
+    return is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line)
 
 
 @tried
@@ -120,7 +121,7 @@ def usual_case(random: Random, length: float = 0.007, thread: float = 0.019, wit
     """Return a needle with a thread that leaves backwards and crosses nothing."""
     needle = random_needle(random, length, within)
     line = winding_line(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), thread)
-    if is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line):
+    if _is_simple(needle, line):
         return Case(needle, line, lighting=random_lighting(random), quality=int(random.integers(80, 97)))
     return None
 
@@ -143,14 +144,12 @@ def _folded(low: float, high: float, length: float, random: Random) -> Case | No
         begun, start, angle = needle.tail[None], needle.tail, needle.heading + fold
     straight = winding_line(random, start, angle, along, 60.0)
     line = np.vstack([begun, straight[1:]])
-    leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-    line = np.vstack([line, winding_line(random, line[-1], leaving, 0.019 - arc_lengths(line)[-1])[1:]])
+    line = continued(random, line, 0.019 - arc_lengths(line)[-1])
     beyond = line[arc_lengths(line) > 1.4 * length + 1e-3]
     if is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
-        labels = {"fold": math.degrees(fold), "how": how}
-        width = random.uniform(0.8, 1.6)
-        light, over = random_lighting(random), how == "over"
-        return Case(needle, line, thread_px=width, lighting=light, thread_over=over, labels=labels)
+        width, labels = random.uniform(0.8, 1.6), {"fold": math.degrees(fold), "how": how}
+        look: dict[str, Any] = {"lighting": random_lighting(random), "thread_over": how == "over"}
+        return Case(needle, line, thread_px=width, labels=labels, **look)
     return None
 
 
@@ -158,9 +157,8 @@ def _folded(low: float, high: float, length: float, random: Random) -> Case | No
 def thread_with_loop(random: Random) -> Case | None:
     """Return a thread with a loop."""
     needle = random_needle(random)
-    first = winding_line(
-        random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.3), random.uniform(4e-3, 7e-3)
-    )
+    backwards = needle.heading + np.pi + random.normal(0.0, 0.3)
+    first = winding_line(random, needle.tail, backwards, random.uniform(4e-3, 7e-3))
     angle = math.atan2(*(first[-1] - first[-2])[::-1])
     turn, radius = random.choice((-1.0, 1.0)), random.uniform(1.2e-3, 2.2e-3)
     turns = np.arange(0.0, random.uniform(1.7, 1.95) * np.pi, TURN_STEP / radius)
@@ -186,29 +184,17 @@ def _crossing_needle(random: Random) -> Case | None:
     way = math.cos(lean := random.uniform(-0.7, 0.7)) * aside + math.sin(lean) * along
     back = -unit_vector(needle.heading)
     out = needle.tail + 2.2e-3 * back
-    knots = [
-        needle.tail,
-        needle.tail + 0.9e-3 * back,
-        out - 1.2e-3 * aside,
-        at - 2.6e-3 * way,
-        at,
-        at + 2.6e-3 * way,
-    ]
-    line = smooth_line(np.array(knots))
-    leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-    line = np.vstack([line, winding_line(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
+    begin, end = (needle.tail, needle.tail + 0.9e-3 * back, out - 1.2e-3 * aside), (at - 2.6e-3 * way, at)
+    knots = np.array([*begin, *end, at + 2.6e-3 * way])
+    lengths = arc_lengths(knots)  # a smooth line, cubic in the chord length, with vertices of equal distance
+    line = CubicSpline(lengths, knots)(np.linspace(0.0, lengths[-1], 400))
+    line = points_at(line, np.arange(0.0, arc_lengths(line)[-1], TURN_STEP))
+    line = continued(random, line, random.uniform(6e-3, 9e-3), 150.0)
     after = line[(arc_lengths(line) > 1.5e-3)]
     near = needle.distances(after[::4])
     if is_inside(line) and (near < 0.5 * needle.width).sum() < 15 and near[-30:].min() > 1e-3:
         return Case(needle, line, lighting=random_lighting(random), thread_over=bool(random.random() < 0.5))
     return None
-
-
-def smooth_line(knots: Points) -> Points:
-    """Return a smooth line through points, cubic in the chord length, with vertices of equal distance."""
-    at = arc_lengths(knots)
-    line = CubicSpline(at, knots)(np.linspace(0.0, at[-1], 400))
-    return points_at(line, np.arange(0.0, arc_lengths(line)[-1], TURN_STEP))
 
 
 @tried
@@ -273,7 +259,7 @@ def _below(
     axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
     keep = np.vstack([axis, case.thread[:20]])
     if all(depth_inside(outline, keep) < -CLEARANCE for outline in outlines):
-        covers = tuple(Cover(*each, blur_px) for each in zip(outlines, colours, strict=True))
+        covers = tuple(Cover(*cover, blur_px) for cover in zip(outlines, colours, strict=True))
         return replace(case, hidden_by=covers)
     return None
 
@@ -336,10 +322,9 @@ def _distorted(told: bool, random: Random) -> Case:
 def _cut_dish(least: float, greatest: float, random: Random) -> Case | None:
     """Return a dish of which the frame shows a part, with all of needle and thread."""
     case = usual_case(random)
-    shift = (
-        random.uniform(least, greatest) * DISH_RADIUS / SCALE * unit_vector(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
-    )
-    moved = replace(case, shift=(float(shift[0]), float(shift[1])))
+    distance = random.uniform(least, greatest) * DISH_RADIUS / SCALE
+    u, v = distance * unit_vector(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+    moved = replace(case, shift=(float(u), float(v)))
     ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
     at = moved.view.to_pixels(np.vstack([ends, case.thread]))
     if at.min() > 25.0 and (at < np.array(moved.size) - 25.0).all():
@@ -359,7 +344,7 @@ def _suture_needle(random: Random) -> Case:
         needle = replace(random_needle(random, length, width=width), curvature=random.uniform(-np.pi, np.pi) / length)
         line = winding_line(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), 0.015)
         axis, _ = needle.axis(np.linspace(0.0, 1.0, 20))
-        if is_inside(line) and is_inside(axis) and _is_clear(needle, line) and not _crosses_itself(line):
+        if is_inside(axis) and _is_simple(needle, line):
             return Case(needle, line, lighting=random_lighting(random))
     raise RuntimeError("no thread fits into the dish")
 
@@ -415,7 +400,7 @@ def _glare_thread(random: Random) -> Case | None:
     axes, turn = random.uniform(0.5e-3, 2e-3, 2), random.uniform(0.0, np.pi)
     spot = axes * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
     spot = at + spot @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-    return _below(case, [spot], [GLARE_BGR], 2.0)
+    return _below(case, [spot], [(262.0, 262.0, 262.0)], 2.0)
 
 
 @tried
@@ -427,16 +412,16 @@ def _hand_instrument(random: Random) -> Case | None:
     way = math.cos(lean := random.uniform(-0.8, 0.8)) * outward + math.sin(lean) * np.array([-outward[1], outward[0]])
     instrument = straight_strip(at - 2e-3 * way, way, 0.06, random.uniform(1.5e-3, 3e-3))
     hand = straight_strip(at + random.uniform(6e-3, 10e-3) * way, way, 0.06, random.uniform(8e-3, 14e-3))
-    return _below(case, [instrument, hand], [INSTRUMENT_BGR, SKIN_BGR])
+    return _below(case, [instrument, hand], [(120.0, 118.0, 115.0), (150.0, 170.0, 225.0)])
 
 
 def _through(random: Random, place: Points, direction: float) -> tuple[Points, int]:
     """Return another thread through a place in a direction, and the number of its vertex there."""
-    halves = [
+    back, on = (
         winding_line(random, place, direction + turn, 0.5 * random.uniform(12e-3, 22e-3), 200.0)
         for turn in (math.pi, 0)
-    ]
-    return np.vstack([halves[0][::-1], halves[1][1:]]), len(halves[0]) - 1
+    )
+    return np.vstack([back[::-1], on[1:]]), len(back) - 1
 
 
 def _with(case: Case, other: Points, labels: dict[str, float]) -> Case | None:
@@ -492,7 +477,7 @@ CLASSES: dict[str, MakeCase] = {
     **{f"wall_{end}": partial(_at_wall, end) for end in ("tip", "tail", "side")},
     **{f"width_{columns}": partial(_image_width, columns) for columns in SIZES},
     **{f"thread_{colour}_{px:g}px": partial(_thread, colour, px) for colour in COLOURS for px in WIDTHS_PX},
-    **{f"cover_{mm:g}mm": partial(_covered, 1e-3 * mm) for mm in COVERS},
+    **{f"cover_{mm:g}mm": partial(_covered, 1e-3 * mm) for mm in (1.5, 3.0, 6.0, 10.0)},
     "second_needle": _second_needle,
     **{f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)},
     "saturated": _saturated,

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import Track, VisionTracker, published_centreline, warm_up
+from magnetosuture_thread.vision.tracker import Track, VisionTracker, published_centreline
 
 WRONG_PX, WRONG_ANGLE = 2.0, math.radians(5.0)  # of the scale worked at: beyond, a pose is wrong
 REVERSED = 0.5 * math.pi
@@ -28,6 +27,7 @@ UNKNOWN_ANGLE = 1.0  # rad; a standard deviation beyond which the heading is cal
 HONEST = 14.16  # squared Mahalanobis distance of three numbers that 0.27 % of honest poses exceed
 WRONG_LINE_PX = 1.5  # beyond, or beyond half of the thread's width, a point of a centreline is wrong
 WRONG_END = 0.6e-3  # m; from the thread's end, beyond which an end claimed free is wrong
+COUNTS = ("found", "unknown", "misplaced", "complete", "incomplete", "free", "not_free")
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,6 @@ class Result:
     Attributes:
         visible: length of the thread that can be seen [m].
         seconds: of CPU.
-        reason: why there is no pose.
         found: whether there is a pose.
         unknown: whether its heading is unknown by its own covariance.
         tail_px: how far the tail is off, at the scale worked at.
@@ -60,7 +59,6 @@ class Result:
 
     visible: float
     seconds: float
-    reason: str = ""
     found: bool = False
     unknown: bool = False
     tail_px: float = 0.0
@@ -82,7 +80,7 @@ class Result:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the pose would mislead; one that says that its heading is unknown does not by it."""
+        """Whether the pose misleads; one that says that its heading is unknown does not by it."""
         return self.found and not self.unknown and (self.tail_px > WRONG_PX or self.angle > WRONG_ANGLE)
 
     @property
@@ -117,7 +115,6 @@ class Row:
         not_free: of these, that are not.
         normalised: root mean square of points' distances from the thread over their standard deviation; 1 is honest.
         median_ms: CPU time of a frame.
-        reasons: why there was no pose, with their counts.
     """
 
     name: str
@@ -141,7 +138,6 @@ class Row:
     not_free: int
     normalised: float | None
     median_ms: float
-    reasons: dict[str, int]
 
 
 def frame_of(name: str, index: int, seed: int) -> tuple[Case, Image]:
@@ -153,11 +149,10 @@ def frame_of(name: str, index: int, seed: int) -> tuple[Case, Image]:
 
 def measure(case: Case, image: Image) -> Result:
     """Give a frame to a tracker that has seen no other, and compare."""
-    lengths = arc_lengths(case.thread)
     settings = VisionTrackerSettings(
         needle_length=case.needle.length * (1.0 + case.length_error),
         needle_width=case.needle.width,
-        thread_length=float(lengths[-1]),
+        thread_length=float(arc_lengths(case.thread)[-1]),
     )
     tracker = VisionTracker(settings, Scene(dish=Dish(2.0 * DISH_RADIUS)))
     tracker.set_lens(case.lens)
@@ -173,18 +168,19 @@ def compare(case: Case, track: Track, seconds: float) -> Result:
     seen, truth = case.visible_thread(), dense(case.thread)
     visible = float(arc_lengths(case.thread)[-1]) / len(truth) * len(seen)
     if not len(track.tail):
-        return Result(visible, seconds, track.reason)
-    off = np.append(track.tail - case.needle.tail, 0.0)
+        return Result(visible, seconds)
     turned = math.atan2(track.heading[1], track.heading[0]) - case.needle.heading
-    off[2] = (turned + math.pi) % (2.0 * math.pi) - math.pi
+    off = np.append(track.tail - case.needle.tail, (turned + math.pi) % (2.0 * math.pi) - math.pi)
     bound = max(WRONG_LINE_PX * case.working_scale, 0.5 * case.thread_px * case.view.metres_per_pixel)
-    line = published_centreline(track)
-    covered = wrong = length = 0.0
+    line, lengths = published_centreline(track), dict[str, Any]()
     if len(line) > 1:
-        own = dense(line)
-        length = float(arc_lengths(line)[-1])
-        wrong = length * _share(own, truth, bound, beyond=True)
-        covered = visible * _share(seen, own, bound)
+        points, length = dense(line), float(arc_lengths(line)[-1])
+        lengths = {"line": length, "wrong": length * (1.0 - _share(points, truth, bound))}
+        lengths["covered"] = visible * _share(seen, points, bound)
+    pieces = _compare_pieces(track.observation, truth, bound) if track.observation.pieces else {}
+    if pieces:
+        points = np.vstack([dense(piece.points) for piece in track.observation.pieces])
+        pieces["pieces"] = visible * _share(seen, points, bound)
     return Result(
         visible,
         seconds,
@@ -193,122 +189,85 @@ def compare(case: Case, track: Track, seconds: float) -> Result:
         tail_px=float(np.hypot(off[0], off[1])) / case.working_scale,
         angle=abs(float(off[2])),
         honest=float(off @ np.linalg.solve(track.covariance, off)) < HONEST,
-        covered=covered,
-        line=length,
-        wrong=wrong,
-        **compare_pieces(case, track.observation, bound, seen, visible),
+        **lengths,
+        **pieces,
     )
 
 
-def compare_pieces(
-    case: Case, observation: ThreadObservation, bound: float, seen: Points, visible: float
-) -> dict[str, Any]:
+def _compare_pieces(observation: ThreadObservation, truth: Points, bound: float) -> dict[str, Any]:
     """Compare pieces of the thread with the ground truth; return the part of a `Result` on them.
 
     Args:
-        case: what the frame shows.
-        observation: what is said of it.
+        observation: what is said of the thread.
+        truth: points along all of it, shape (m, 2) [m].
         bound: beyond which a point is wrong [m].
-        seen: points along the visible thread, shape (m, 2) [m].
-        visible: its length [m].
     """
-    if not observation.pieces:
-        return {}
-    truth = dense(case.thread)
-    at, tree = arc_lengths(truth), KDTree(truth)
-    lines = [dense(piece.points) for piece in observation.pieces]
-    found: dict[str, Any] = {
-        "complete": observation.complete,
-        "pieces": visible * _share(seen, np.vstack(lines), bound),
-    }
-    sums: Any = Counter()  # of numbers that are not whole
-    for piece, line in zip(observation.pieces, lines, strict=True):
+    at, tree, sums = arc_lengths(truth), KDTree(truth), Counter[str]()
+    for piece in observation.pieces:
         off, nearest = (np.asarray(values) for values in tree.query(piece.points))
         ends = ((piece.first_end, piece.points[0]), (piece.last_end, piece.points[-1]))
         free = [float(np.hypot(*(point - truth[-1]))) for end, point in ends if end is PieceEnd.FREE]
-        sums.update(
-            length=piece.length,
-            wrong_pieces=piece.length * _share(line, truth, bound, beyond=True),
-            normalised=float(np.square(off / piece.deviation)[off < bound].sum()),
-            points=int((off < bound).sum()),
-            misplaced=int(_is_misplaced(piece, at[nearest])),
-            free=len(free),
-            not_free=sum(apart > WRONG_END for apart in free),
-        )
-    last = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
-    shown = at[-1] * _share(truth, lines[0], max(bound, WRONG_END))
-    found["incomplete"] = bool(observation.complete and (last > WRONG_END or shown < at[-1] - WRONG_END))
-    return {**found, **sums}
+        figures: Any = {  # some of them are no whole numbers
+            "length": piece.length,
+            "wrong_pieces": piece.length * (1.0 - _share(dense(piece.points), truth, bound)),
+            "normalised": float(np.square(off / piece.deviation)[off < bound].sum()),
+            "points": int((off < bound).sum()),
+            "misplaced": int(_is_misplaced(piece, at[nearest])),
+            "free": len(free),
+            "not_free": sum(apart > WRONG_END for apart in free),
+        }
+        sums.update(figures)
+    first = observation.pieces[0].points
+    last = float(np.hypot(*(first[-1] - truth[-1])))
+    shown = at[-1] * _share(truth, dense(first), max(bound, WRONG_END))
+    incomplete = observation.complete and (last > WRONG_END or shown < at[-1] - WRONG_END)
+    return {"complete": observation.complete, "incomplete": bool(incomplete), **sums}
 
 
 def _is_misplaced(piece: ThreadPiece, truth: np.ndarray) -> bool:
-    """Say whether a piece lies elsewhere along the thread than is said; `truth` is the arc length at its points [m]."""
-    along = arc_lengths(piece.points)
+    """Return whether a piece lies elsewhere along the thread than is said; `truth` is the arc length at its points."""
+    along, known = arc_lengths(piece.points), math.isfinite(piece.arc_length[0])
     # Medians: where the thread crosses itself, the nearest point of it may be of the other strand.
     grows = float(np.median(np.diff(truth))) > 0.0
-    first = float(np.median(truth - along)) if grows else float(np.median(truth + along))
-    if piece.direction_known and not grows and math.isfinite(piece.arc_length[0]):
-        return True
-    if not math.isfinite(piece.arc_length[0]):
-        return False
-    if not piece.direction_known and not grows:
-        first = float(np.median(truth + along)) - float(along[-1])
+    if not known or (piece.direction_known and not grows):
+        return known
+    first = float(np.median(truth - along)) if grows else float(np.median(truth + along)) - float(along[-1])
     return not piece.arc_length[0] - WRONG_END <= first <= piece.arc_length[1] + WRONG_END
 
 
-def _share(points: Points, line: Points, bound: float, *, beyond: bool = False) -> float:
-    """Return which share of points lies within a bound of a line of points close together, or beyond it."""
-    if not len(points):
-        return 0.0
-    near = np.asarray(KDTree(line).query(points)[0]) < bound
-    return float(np.mean(~near if beyond else near))
+def _share(points: Points, line: Points, bound: float) -> float:
+    """Return which share of points lies within a bound of a line of points close together."""
+    return float(np.mean(np.asarray(KDTree(line).query(points)[0]) < bound)) if len(points) else 0.0
 
 
 def row_of(name: str, results: Iterable[Result]) -> Row:
     """Sum up the results of a class."""
-    every = list(results)
-    found = [each for each in every if each.found]
-    right = [each for each in found if not each.is_wrong and not each.unknown]
-    total: Counter[str] = Counter()
-    for each in every:
-        total.update({name: value for name, value in vars(each).items() if name != "reason"})
+    frames = list(results)
+    found = [frame for frame in frames if frame.found]
+    right = [frame for frame in found if not frame.is_wrong and not frame.unknown]
+    total = {field.name: sum(getattr(frame, field.name) for frame in frames) for field in fields(Result)}
+
+    def share(part: str, whole: str) -> float | None:
+        return total[part] / total[whole] if total[whole] else None
+
+    def root_mean_square(values: list[float]) -> float | None:
+        return float(np.sqrt(np.mean(np.square(values)))) if values else None
+
+    normalised = share("normalised", "points")
     return Row(
         name=name,
-        frames=len(every),
-        found=len(found),
-        unknown=sum(each.unknown for each in found),
-        wrong=sum(each.is_wrong for each in found),
-        reversed=sum(each.is_reversed for each in found),
-        dishonest=sum(not each.honest for each in found),
-        tail_px=_root_mean_square([each.tail_px for each in right]),
-        angle_deg=_root_mean_square([math.degrees(each.angle) for each in right]),
-        covered=total["covered"] / total["visible"] if total["visible"] else 0.0,
-        covered_90=float(np.mean([each.covered >= 0.9 * each.visible for each in every])),
-        wrong_line=total["wrong"] / total["line"] if total["line"] else None,
-        pieces=total["pieces"] / total["visible"] if total["visible"] else 0.0,
-        wrong_pieces=total["wrong_pieces"] / total["length"] if total["length"] else None,
-        **{name: total[name] for name in ("misplaced", "complete", "incomplete", "free", "not_free")},
-        normalised=math.sqrt(total["normalised"] / total["points"]) if total["points"] else None,
-        median_ms=1e3 * float(np.median([each.seconds for each in every])),
-        reasons=dict(Counter(re.sub(r"\d", "#", each.reason) for each in every if not each.found).most_common()),
+        frames=len(frames),
+        wrong=sum(frame.is_wrong for frame in found),
+        reversed=sum(frame.is_reversed for frame in found),
+        dishonest=sum(not frame.honest for frame in found),
+        tail_px=root_mean_square([frame.tail_px for frame in right]),
+        angle_deg=root_mean_square([math.degrees(frame.angle) for frame in right]),
+        covered=share("covered", "visible") or 0.0,
+        covered_90=float(np.mean([frame.covered >= 0.9 * frame.visible for frame in frames])),
+        wrong_line=share("wrong", "line"),
+        pieces=share("pieces", "visible") or 0.0,
+        wrong_pieces=share("wrong_pieces", "length"),
+        normalised=None if normalised is None else math.sqrt(normalised),
+        median_ms=1e3 * float(np.median([frame.seconds for frame in frames])),
+        **{field: total[field] for field in COUNTS},
     )
-
-
-def _root_mean_square(values: list[float]) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else None
-
-
-def measure_vision(
-    names: list[str], count: int, seed: int, progress: Callable[[float], None] = lambda share: None
-) -> tuple[list[Row], dict[str, Any]]:
-    """Measure frames of each class; return the rows, and them as figures."""
-    rows = []
-    warm_up()  # and one thread
-    for number, name in enumerate(names):
-        results = []
-        for index in range(count):
-            case, image = frame_of(name, index, seed)
-            results.append(measure(case, image))
-            progress((number + (index + 1) / count) / len(names))
-        rows.append(row_of(name, results))
-    return rows, {"count": count, "seed": seed, "rows": [asdict(row) for row in rows]}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -13,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.vision.dish import FoundDish, see_dish
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.dish import FoundDish
 
 Image = NDArray[np.uint8]
 Plane = NDArray[np.float32]
@@ -194,46 +192,22 @@ PHOTOGRAPHS: dict[str, Callable[[np.random.Generator], Photograph]] = {
 }
 
 
-def straightened(found: FoundDish, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def straightened(dish: FoundDish, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points of a photograph where they are once the tilt that was found is taken out, shape (m, 2) [px]."""
-    if found.tilt is None:
+    if dish.tilt is None:
         return points
-    along = np.array([math.cos(found.tilt.direction), math.sin(found.tilt.direction)])
-    offset = points - np.array(found.view.centre_px)
-    return np.asarray(points + (1.0 / math.cos(found.tilt.angle) - 1.0) * np.outer(offset @ along, along))
+    along = np.array([math.cos(dish.tilt.direction), math.sin(dish.tilt.direction)])
+    offset = points - np.array(dish.view.centre_px)
+    return np.asarray(points + (1.0 / math.cos(dish.tilt.angle) - 1.0) * np.outer(offset @ along, along))
 
 
-def ellipse_error(found: FoundDish, diameter: float, points: NDArray[np.float64]) -> float:
+def ellipse_error(dish: FoundDish, diameter: float, points: NDArray[np.float64]) -> float:
     """Return the mean distance of points from the ellipse that was found, in its radii."""
-    radius = 0.5 * diameter / found.view.metres_per_pixel
-    offset = straightened(found, points) - np.array(found.view.centre_px)
+    radius = 0.5 * diameter / dish.view.metres_per_pixel
+    offset = straightened(dish, points) - np.array(dish.view.centre_px)
     return float(np.mean(np.abs(np.hypot(*offset.T) / radius - 1.0)))
 
 
 def photo_of(name: str, index: int, seed: int) -> Photograph:
     """Return a photograph of a class with a number."""
     return PHOTOGRAPHS[name](np.random.default_rng([seed, index, len(name), *name.encode()]))
-
-
-def measure_photographs(names: list[str], count: int, seed: int) -> dict[str, Any]:
-    """Look for the dish in photographs of each class.
-
-    Returns:
-        A row of figures of each class: in how many a dish is found, and of these, how many with an ellipse within
-        `RIGHT` of the wall's inner edge, at the floor or at the top; and the CPU time of a frame.
-    """
-    rows = []
-    settings = VisionTrackerSettings()
-    for name in names:
-        found, right, times = 0, 0, []
-        for index in range(count):
-            photo = photo_of(name, index, seed)
-            began = time.process_time()
-            dish = see_dish(photo.image, settings, DIAMETER)
-            times.append(1e3 * (time.process_time() - began))
-            if dish is not None:
-                found += 1
-                right += min(ellipse_error(dish, DIAMETER, at) for at in (photo.floor, photo.top)) < RIGHT
-        figures = {"found": found, "right": right, "median_ms": float(np.median(times)), "max_ms": max(times)}
-        rows.append({"name": name, "count": count, **figures})
-    return {"count": count, "seed": seed, "rows": rows}

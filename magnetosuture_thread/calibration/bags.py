@@ -99,15 +99,8 @@ def calibrate_bags(
     best = BestSettings()
     try:
         with replay_pool(runs, min(workers, os.cpu_count() or 1), scheduler) as run:
-            result, fits = calibrate(
-                runs,
-                settings,
-                parameters,
-                run_tasks=run,
-                best=best,
-                progress=lambda share: progress(READING + (1.0 - READING) * share),
-                log=log,
-            )
+            stages: dict[str, Any] = {"progress": lambda share: progress(READING + (1.0 - READING) * share), "log": log}
+            result, fits = calibrate(runs, settings, parameters, run_tasks=run, best=best, **stages)
     except KeyboardInterrupt:
         if best.settings is None:
             raise
@@ -126,9 +119,9 @@ def _read_run(path: Path, bag: BagInput, settings: ThreadModelSettings, against:
     Raises:
         BagError: it cannot be used.
     """
-    observations, notes = bag.observations(advance), bag.recording.notes
+    observations, simulated = bag.observations(advance), bag.recording.notes.get("simulated", "")
     try:
-        run = read_run(str(path), observations, settings, against, notes.get("simulated", ""), bag.setup.scene)
+        run = read_run(str(path), observations, settings, against, simulated, bag.setup.scene)
     except BagError:
         if problem := observations.thread_problem():
             raise BagError(path, problem) from None

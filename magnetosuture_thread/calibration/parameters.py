@@ -19,12 +19,7 @@ from typing import Any
 
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.thread.material import (
-    MATERIALS,
-    MAX_ELASTIC_MODULUS,
-    MAX_REST_ANGLE,
-    MIN_ELASTIC_MODULUS,
-)
+from magnetosuture_thread.thread.material import MATERIALS, MAX_ELASTIC_MODULUS, MAX_REST_ANGLE, MIN_ELASTIC_MODULUS
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"

@@ -132,7 +132,7 @@ def read_run(
         stamp, last = observation.stamp, poses[-1][0] if poses else None
         counts.update(needle=1, seen=len(observation.measured) > 1, truth=len(observation.ground_truth) > 1)
         curves = {"seen": observation.measured, "truth": observation.ground_truth}
-        found = {which: target_points(curve, length, settings.segments) for which, curve in curves.items()}
+        nodes = {which: target_points(curve, length, settings.segments) for which, curve in curves.items()}
         if last is not None and stamp <= last:
             if stamp < last - 1_000_000_000:
                 back = (last - stamp) * 1e-9
@@ -140,8 +140,8 @@ def read_run(
             continue
         if last is None or stamp > last + GAP:
             # As a thread of the node starts; where it does not from this frame, there is no shape.
-            told = observation.observation
-            initial = observation.measured if told is None else start.shape(stamp, told)
+            pieces = observation.observation
+            initial = observation.measured if pieces is None else start.shape(stamp, pieces)
             if initial is None or len(initial) < 2 or arc_lengths(initial)[-1] < enough:
                 continue
             legs.append(len(poses))
@@ -149,42 +149,29 @@ def read_run(
         poses.append((stamp, observation.tail, observation.heading))
         # Before, the noise of the leg's first centreline has not straightened out.
         is_settled = stamp >= poses[legs[-1]][0] + round(SETTLING * 1e9)
-        if is_settled and found[against][1] >= enough:
-            compared.append((len(poses) - 1, found[against][0], found["truth"][0]))
-    if not counts["needle"]:
-        raise BagError(name, "shows no needle in any frame; is it another setup's?")
-    if not counts["seen"]:
-        raise BagError(name, "shows no thread in any frame: nothing to start from or to compare with")
-    if not poses:
-        raise BagError(name, "never shows half of the thread or more: nothing to start from")
-    if against == "truth" and not counts["truth"]:
-        raise BagError(name, "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen")
-    ends = [*legs[1:], len(poses)]
-    duration = sum(poses[end - 1][0] - poses[leg][0] for leg, end in zip(legs, ends, strict=True)) * 1e-9
-    if duration < MIN_DURATION:
-        expected = f"expected at least {MIN_DURATION:g} s"
-        raise BagError(name, f"is too short: {duration:.1f} s with needle and thread, {expected}")
-    if len(compared) < MIN_FRAMES:
-        known = "measured" if against == "seen" else "known from ground truth"
-        words = f"in {len(compared)} frames, the first second left out, is half of the thread or more {known}"
-        raise BagError(name, f"is of no use: {words}, expected at least {MIN_FRAMES}")
+        if is_settled and nodes[against][1] >= enough:
+            compared.append((len(poses) - 1, nodes[against][0], nodes["truth"][0]))
+    legs_and_ends = zip(legs, [*legs[1:], len(poses)], strict=False)  # none without poses
+    duration = 1e-9 * sum(poses[end - 1][0] - poses[leg][0] for leg, end in legs_and_ends)
+    too_short = f"is too short: {duration:.1f} s with needle and thread, expected at least {MIN_DURATION:g} s"
+    known = "measured" if against == "seen" else "known from ground truth"
+    few = f"in {len(compared)} frames, the first second left out, is half of the thread or more {known}"
+    no_truth = "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen"
+    for is_there, problem in (
+        (not counts["needle"], "shows no needle in any frame; is it another setup's?"),
+        (not counts["seen"], "shows no thread in any frame: nothing to start from or to compare with"),
+        (not poses, "never shows half of the thread or more: nothing to start from"),
+        (against == "truth" and not counts["truth"], no_truth),
+        (duration < MIN_DURATION, too_short),
+        (len(compared) < MIN_FRAMES, f"is of no use: {few}, expected at least {MIN_FRAMES}"),
+    ):
+        if is_there:
+            raise BagError(name, problem)
     chosen = np.unique(np.linspace(0, len(compared) - 1, min(MAX_FRAMES, len(compared))).round().astype(int))
-    stamps, tails, headings = zip(*poses, strict=True)
-    frames, targets, truths = zip(*(compared[index] for index in chosen), strict=True)
-    run = RecordedRun(
-        name,
-        np.array(stamps, dtype=np.int64),
-        np.array(tails),
-        np.array(headings),
-        tuple(legs),
-        tuple(initials),
-        np.array(frames),
-        np.array(targets),
-        np.array(truths),
-        against=against,
-        simulated=simulated,
-        scene=scene,
-    )
+    stamps, tails, headings = map(np.array, zip(*poses, strict=True))
+    frames, targets, truths = map(np.array, zip(*(compared[index] for index in chosen), strict=True))
+    thread = tuple(legs), tuple(initials), frames, targets, truths
+    run = RecordedRun(name, stamps, tails, headings, *thread, against, simulated, scene)
     moved = _moved(run) / length
     if moved < SLOW:
         why = "nothing moves" if moved < 0.02 else "the needle is too slow"
@@ -195,11 +182,9 @@ def read_run(
 
 def _moved(run: RecordedRun) -> float:
     """Return the diagonal of the box that the needle or a node moves in [m]; means over a second leave noise out."""
-    parts = (run.times).astype(int)
-    nodes = np.concatenate([run.tails[run.frames][:, None], run.targets], axis=1)
-    means = np.array(
-        [np.ma.masked_invalid(nodes[parts == part]).mean(axis=0).filled(np.nan) for part in np.unique(parts)]
-    )
+    parts = run.times.astype(int)
+    nodes = np.ma.masked_invalid(np.concatenate([run.tails[run.frames][:, None], run.targets], axis=1))
+    means = np.array([nodes[parts == part].mean(axis=0).filled(np.nan) for part in np.unique(parts)])
     way = means[:, np.isfinite(means[..., 0]).sum(axis=0) > 1]
     extent = np.nanmax(way, axis=0) - np.nanmin(way, axis=0)
     return float(np.hypot(extent[:, 0], extent[:, 1]).max())
@@ -226,9 +211,9 @@ def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> P
                 pass
             for index in range(leg, end):
                 stamp = int(run.stamps[index])
-                found = session.on_pose(stamp, NeedlePose(stamp * 1e-9, run.tails[index], run.headings[index]))
-                if found.prediction is not None:
-                    last = found.prediction.positions
+                result = session.on_pose(stamp, NeedlePose(stamp * 1e-9, run.tails[index], run.headings[index]))
+                if result.prediction is not None:
+                    last = result.prediction.positions
                 elif index == leg:
                     break
                 if index in slots:
@@ -315,9 +300,8 @@ def mean_error(vertices: Points, targets: Points, length: float) -> float:
 
     A node that is not predicted counts as a length off; not a number if nothing is known.
     """
-    found = node_errors(vertices, targets, length)
-    known = np.isfinite(targets[..., 0])
-    frames = np.ma.masked_array(np.where(np.isfinite(found), found, 100.0), ~known).mean(axis=1)
+    errors, known = node_errors(vertices, targets, length), np.isfinite(targets[..., 0])
+    frames = np.ma.masked_array(np.where(np.isfinite(errors), errors, 100.0), ~known).mean(axis=1)
     return float(frames.mean()) if known.any() else math.nan
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from rich.table import Table
 
 from magnetosuture_thread.bags.storage import MAX_SILENCE
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
@@ -152,9 +150,11 @@ class BagFit(NamedTuple):
         across = [mean_across(vertices, run, length) for vertices in (self.before, self.after)]
         times = (run.stamps - run.stamps[0]) * 1e-9
         silence = SensorSilence.of(times, 0.0, float(times[-1]))
-        found = BagErrors(run.name, len(run.frames), *errors, *across)
-        words = str(silence) if silence.max_gap > MAX_SILENCE else ""
-        return replace(found, unverified=run.unverified, simulated=run.simulated, silence=words)
+        words: dict[str, Any] = {
+            "silence": str(silence) if silence.max_gap > MAX_SILENCE else "",
+            "simulated": run.simulated,
+        }
+        return BagErrors(run.name, len(run.frames), *errors, *across, unverified=run.unverified, **words)
 
 
 @dataclass(frozen=True)
@@ -179,29 +179,15 @@ class CalibrationResult:
     replays: int
     finished: bool = True
 
-    @classmethod
-    def of(
-        cls,
-        settings: ThreadModelSettings,
-        fits: Sequence[BagFit],
-        estimates: Sequence[Estimate],
-        attachment: AttachmentDecision | None,
-        replays: int,
-        finished: bool = True,
-    ) -> CalibrationResult:
-        """Return the result of fits of some bags."""
-        scores = tuple(fit.errors(settings.thread_length) for fit in fits)
-        return cls(settings, fits[0].run.against, tuple(estimates), attachment, scores, replays, finished)
-
     @property
     def warnings(self) -> list[str]:
         """Warnings for the user."""
         lines = []
-        for estimate in [estimate for estimate in self.estimates if estimate.reason]:
-            lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")
-            if estimate.status == STAND_IN:
-                value = f"{estimate.value:.4g} {estimate.unit}".rstrip()
-                lines[-1] += f"; {value} stands in, as it predicts better than what the setup says"
+        for estimate in (estimate for estimate in self.estimates if estimate.reason):
+            value = f"{estimate.value:.4g} {estimate.unit}".rstrip()
+            end = f"; {value} stands in, as it predicts better than what the setup says"
+            words = f"{estimate.name} cannot be identified in this data: {estimate.reason}"
+            lines.append(words + end * (estimate.status == STAND_IN))
         if self.attachment is not None and self.attachment.reason:
             lines.append(f"the attachment cannot be told: {self.attachment.reason}")
         lines += [f"{score.name} is unverified: {score.unverified}" for score in self.scores if score.unverified]
@@ -242,7 +228,7 @@ def to_yaml(calibration: CalibrationResult) -> str:
     if settings.formulation == "rod":
         lines += _attachment(calibration)
     for name in dict.fromkeys(estimate.setting for estimate in calibration.estimates):
-        lines += _setting(name, [each for each in calibration.estimates if each.setting == name], settings)
+        lines += _setting(name, [entry for entry in calibration.estimates if entry.setting == name], settings)
     return "\n".join(lines) + "\n"
 
 
@@ -282,7 +268,7 @@ def _comment(text: str, indent: str = "") -> list[str]:
 def _entry(name: str, value: Any, note: str = "") -> str:
     """Return a line of the section: a float has its point, as ROS and any YAML reader take it, and six digits."""
     if isinstance(value, tuple):
-        value = [float(f"{each:.6g}") for each in value]
+        value = [float(f"{estimate:.6g}") for estimate in value]
     elif isinstance(value, float):
         value = float(f"{value:.6g}")
     text = yaml.safe_dump({name: value}, default_flow_style=None if isinstance(value, list) else False).strip()
@@ -302,10 +288,9 @@ def _attachment(calibration: CalibrationResult) -> list[str]:
 def _setting(name: str, estimates: list[Estimate], settings: ThreadModelSettings) -> list[str]:
     """Return the lines of one setting, with why it is left out or what stands in."""
     lines, is_fixed = [], all(estimate.status == FIXED for estimate in estimates)
-    for estimate in [estimate for estimate in estimates if estimate.reason]:
+    for estimate in (estimate for estimate in estimates if estimate.reason):
         what = "is left out" if is_fixed else f"stays {estimate.start:.4g} {estimate.unit}"
-        if estimate.status != FIXED:
-            what = "is no measurement but what predicts best"
+        what = what if estimate.status == FIXED else "is no measurement but what predicts best"
         lines += _comment(f"{estimate.name} {what}, as this data cannot tell it: {estimate.reason}", "    ")
     if is_fixed:
         return lines
@@ -316,51 +301,3 @@ def _setting(name: str, estimates: list[Estimate], settings: ThreadModelSettings
         units[name] = f"Pa; B = {stiffness_over_drag(settings):.4g} m^4/s"
     value = getattr(settings, name) or ((0.0, 0.0) if name == OFFSET else 0.0)
     return [*lines, _entry(name, value, " ".join(filter(None, (units.get(name), intervals and f"[{intervals}]"))))]
-
-
-def parameter_table(found: Mapping[str, Any]) -> Table:
-    """Return a row for each number, as `Calibration.to_json` gives them."""
-    title = f"{found['material']}, formulation {found['formulation']}"
-    table = Table(title=title if found["finished"] else f"{title}: best so far, not finished")
-    table.caption = "? cannot be identified in this data"
-    for name in ("parameter", "value", "95 % interval", "setup"):
-        table.add_column(name, justify="left" if name == "parameter" else "right", no_wrap=True)
-    for row in found["parameters"]:
-        scale, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
-        interval = "-" if row["low"] is None else f"{scale * row['low']:.3g} to {scale * row['high']:.3g}"
-        value = f"{scale * row['value']:.4g}" + (" ?" if row["reason"] else "")
-        name = f"{row['name']} \\[{unit}]" if unit else row["name"]
-        table.add_row(name, value, interval, f"{scale * row['start']:.4g}")
-    attachment = found["attachment"]
-    if attachment is not None:
-        value = attachment["value"] + (" ?" if attachment["reason"] else "")
-        table.add_row("attachment", value, "-", attachment["start"])
-    return table
-
-
-def bag_table(found: Mapping[str, Any]) -> Table:
-    """Return a row for each bag: prediction errors before and after, and by the other bags."""
-    truth = any(row["truth_after"] is not None for row in found["bags"])
-    fitted = "the measured thread" if found["against"] == "seen" else "ground truth"
-    table = Table(title=f"prediction error, fitted to {fitted}")
-    silences = [f"{row['name']} is {row['silence']}" for row in found["bags"] if row["silence"]]
-    table.caption = "; ".join(["mean over time of the mean distance of the nodes, % of the length", *silences])
-    table.add_column("bag", overflow="fold", min_width=12)
-    table.add_column("frames", justify="right")
-    keys = ["before", "after", *(["held_out"] if len(found["bags"]) > 1 else [])]
-    names = {key: key.replace("_", "\n") for key in keys}
-    if truth and found["against"] == "seen":  # on lines of its own, as eight columns must fit into a terminal's 80
-        names |= {f"truth_{key}": f"ground\ntruth\n{key.replace('_', ' ')}" for key in keys}
-    for name in names.values():
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in found["bags"]:
-        errors = ("-" if row[key] is None else f"{row[key]:.3f}" for key in names)
-        table.add_row(row["name"], str(row["frames"]), *errors)
-    return table
-
-
-def calibration_lines(found: Mapping[str, Any]) -> list[str]:
-    """Return the lines that complement the tables."""
-    simulated = [row["name"] for row in found["bags"] if row["simulated"]]
-    lines = [f"warning: {warning}" for warning in found["warnings"]]
-    return [*lines, f"simulated: {', '.join(simulated)}"] if simulated else lines

@@ -123,7 +123,9 @@ def calibrate(
         named = parameter.name, parameter.setting, parameter.unit
         estimates.append(Estimate(*named, *values, status, each.reason, effect, parameter.kind == "log"))
     progress(1.0)
-    return CalibrationResult.of(fitted, fits, estimates, attachment, replays.best.replays), fits
+    scores = tuple(fit.errors(fitted.thread_length) for fit in fits)
+    result = CalibrationResult(fitted, runs[0].against, tuple(estimates), attachment, scores, replays.best.replays)
+    return result, fits
 
 
 def unfinished_result(
@@ -138,14 +140,16 @@ def unfinished_result(
     """
     found = best.settings or settings
     parameters = [p for p in OF_FORMULATION[settings.formulation] if p.read(found) != p.read(settings)]
-    estimates = [
+    estimates = tuple(
         Estimate(p.name, p.setting, p.unit, p.read(found), p.read(settings), status=UNFINISHED) for p in parameters
-    ]
+    )
     attachment = None
     if found.attachment != settings.attachment:
         attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
     fits = [BagFit(*parts) for parts in zip(runs, best.first, best.vertices, strict=True)]
-    return CalibrationResult.of(found, fits, estimates, attachment, best.replays, finished=False), fits
+    scores = tuple(fit.errors(found.thread_length) for fit in fits)
+    result = CalibrationResult(found, runs[0].against, estimates, attachment, scores, best.replays, finished=False)
+    return result, fits
 
 
 def _robust_fit(objective: Objective) -> FitSolution:

@@ -34,8 +34,7 @@ from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.obstacles import pack_obstacles
 from magnetosuture_thread.geometry.polyline import finite_array
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
-from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.configuration import Quantity, bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.settings.shared_parameters import check_needle
 

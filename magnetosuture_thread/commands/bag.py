@@ -46,12 +46,13 @@ def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """
     with terminal.progress("bag check") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
-        found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share))
-    terminal.print(_table(found))
-    for line in _lines(found):
+        report = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share))
+    terminal.print(_table(report))
+    for line in _lines(report):
         terminal.log(line)
-    command.write_json(options.json, found)
-    return command.FAILED if found["damage"] or found["refused"] or found["salvaged_without_checksum"] else command.DONE
+    command.write_json(options.json, report)
+    is_doubtful = report["damage"] or report["refused"] or report["salvaged_without_checksum"]
+    return command.FAILED if is_doubtful else command.DONE
 
 
 def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> int:
@@ -103,25 +104,25 @@ def _shown(places: list[str]) -> list[str]:
     return [f"  {place}" for place in places[:100]] + ([f"  and {others} other places"] if others > 0 else [])
 
 
-def _table(found: dict[str, Any]) -> Table:
+def _table(report: dict[str, Any]) -> Table:
     """Return a row for each topic."""
     rows = []
-    for topic in found["topics"]:
+    for topic in report["topics"]:
         times = (topic[key] for key in ("rate_hz", "first_s", "last_s", "greatest_gap_s"))
         cells = ("-" if value is None else f"{value:.2f}" for value in times)
         name = one_line(topic["topic"]) + (" *" if topic["known"] else "")
         rows.append((name, str(topic["messages"]), *cells, str(topic["stamps_going_back"])))
-    title = f"{found['messages']} messages in {found['duration_s']:.3f} s"
+    title = f"{report['messages']} messages in {report['duration_s']:.3f} s"
     caption = "times in s since the first message; * is taken by our graph"
     return command.make_table(title, ("topic", "messages", "Hz", "first", "last", "gap", "back"), rows, caption)
 
 
-def _lines(found: dict[str, Any]) -> Iterator[str]:
+def _lines(report: dict[str, Any]) -> Iterator[str]:
     """Return in words what the table does not say."""
-    for topic in found["topics"]:
+    for topic in report["topics"]:
         types = " and ".join(kind.replace("/msg/", "/") for kind in topic["types"])
         yield f"{one_line(topic['topic'])}: {one_line(types) or 'no type'}"
-    for topic in found["topics"]:
+    for topic in report["topics"]:
         name = one_line(topic["topic"])
         if len(topic["types"]) > 1:
             yield f"{name} has two types"
@@ -131,19 +132,19 @@ def _lines(found: dict[str, Any]) -> Iterator[str]:
             yield f"{name}: {topic['stamps_going_back']} stamps are before the one before them"
         if topic["unreadable_stamps"]:
             yield f"{name}: {topic['unreadable_stamps']} stamps cannot be read"
-    yield from _shown([silence_text(each["begin_s"], each["end_s"]) for each in found["silences"]])
-    for file in found["files"]:
+    yield from _shown([silence_text(silence["begin_s"], silence["end_s"]) for silence in report["silences"]])
+    for file in report["files"]:
         yield "; ".join(f"{key} {value}" for key, value in file.items())
-    for key, value in found["notes"].items():
+    for key, value in report["notes"].items():
         yield f"{key}: {shorten(value, 200, placeholder=' ...')}"
-    yield from found["remarks"]
-    doubt = found["salvaged_without_checksum"] or found["has_no_checksum"]
+    yield from report["remarks"]
+    doubt = report["salvaged_without_checksum"] or report["has_no_checksum"]
     if doubt:
         yield doubt
-    for reason, count in found["refused"].items():
+    for reason, count in report["refused"].items():
         yield f"{reason}: {pluralize(count, 'message')} lost"
-    if found["damage"] is not None:
-        yield found["damage"]["text"]
-        yield from _shown([place["text"] for place in found["damage"]["places"]])
-    elif not (found["refused"] or doubt):
+    if report["damage"] is not None:
+        yield report["damage"]["text"]
+        yield from _shown([place["text"] for place in report["damage"]["places"]])
+    elif not (report["refused"] or doubt):
         yield "nothing is damaged"

@@ -1,13 +1,28 @@
-"""The command `magnetosuture calibrate`: fits a thread's parameters to recorded runs."""
+"""The commands `magnetosuture calibrate`, `calibrate-camera` and `calibrate-coils`: fits to measurements."""
 
 from __future__ import annotations
 
 import argparse
+import datetime
+import math
 import os
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
 
-from magnetosuture_thread import calibrate_bags
-from magnetosuture_thread.calibration.result import bag_table, calibration_lines, parameter_table
+from rich.table import Table
+
+from magnetosuture_thread import InvalidInputError, calibrate_bags
+from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
 from magnetosuture_thread.commands import command
+from magnetosuture_thread.commands.track import open_frames
+from magnetosuture_thread.settings.errors import BagError, one_line
+from magnetosuture_thread.settings.files import whole_file
+from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+
+MAX_FRAMES = 50  # that a camera is calibrated by
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -53,14 +68,191 @@ def run_calibrate(options: argparse.Namespace, terminal: command.Terminal) -> in
     is 130. Before there is any, nothing is written, and it is 1.
     """
     names = ("bags", "output", "picture", "material", "formulation", "against", "parameters", "workers", "scheduler")
-    given = {**command.given(options, *names), **command.bag_selection(options)}
+    chosen = {**command.given(options, *names), **command.bag_selection(options)}
     with terminal.progress("calibrate") as advance:
-        result = calibrate_bags(**given, log=terminal.log, progress=advance)
+        result = calibrate_bags(**chosen, log=terminal.log, progress=advance)
     values = result.to_json()
     command.write_json(options.json, values)
-    terminal.print(parameter_table(values))
-    terminal.print(bag_table(values))
-    for line in calibration_lines(values):
-        terminal.log(line)
+    terminal.print(_parameter_table(values))
+    terminal.print(_bag_table(values))
+    for warning in values["warnings"]:
+        terminal.log(f"warning: {warning}")
+    if simulated := [row["name"] for row in values["bags"] if row["simulated"]]:
+        terminal.log(f"simulated: {', '.join(simulated)}")
     terminal.log(f"parameters: {options.output}")
     return command.DONE if result.finished else 130  # as shells have it
+
+
+def _parameter_table(figures: dict[str, Any]) -> Table:
+    """Return a row for each number, as `CalibrationResult.to_json` gives them."""
+    rows = []
+    for row in figures["parameters"]:
+        scale, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
+        value = f"{scale * row['value']:.4g}" + (" ?" if row["reason"] else "")
+        interval = "-" if row["low"] is None else f"{scale * row['low']:.3g} to {scale * row['high']:.3g}"
+        rows.append(
+            (f"{row['name']} [{unit}]" if unit else row["name"], value, interval, f"{scale * row['start']:.4g}")
+        )
+    if (attachment := figures["attachment"]) is not None:
+        rows.append(("attachment", attachment["value"] + " ?" * bool(attachment["reason"]), "-", attachment["start"]))
+    title = f"{figures['material']}, formulation {figures['formulation']}"
+    title += "" if figures["finished"] else ": best so far, not finished"
+    columns = ("parameter", "value", "95 % interval", "setup")
+    return command.make_table(title, columns, rows, "? cannot be identified in this data")
+
+
+def _bag_table(figures: dict[str, Any]) -> Table:
+    """Return a row for each bag: prediction errors before and after, and by the other bags."""
+    bags = figures["bags"]
+    silences = [f"{row['name']} is {row['silence']}" for row in bags if row["silence"]]
+    caption = "; ".join(["mean over time of the mean distance of the nodes, % of the length", *silences])
+    keys = ["before", "after", *(["held_out"] if len(bags) > 1 else [])]
+    names = {key: key.replace("_", "\n") for key in keys}
+    if figures["against"] == "seen" and any(row["truth_after"] is not None for row in bags):
+        # On lines of its own, as eight columns must fit into a terminal's 80.
+        names |= {f"truth_{key}": f"ground\ntruth\n{key.replace('_', ' ')}" for key in keys}
+    rows = [
+        (row["name"], str(row["frames"]), *("-" if row[key] is None else f"{row[key]:.3f}" for key in names))
+        for row in bags
+    ]
+    fitted = "the measured thread" if figures["against"] == "seen" else "ground truth"
+    title = f"prediction error, fitted to {fitted}"
+    return command.make_table(title, ("bag", "frames", *names.values()), rows, caption)
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    command.runs(parser, run_calibrate_camera)
+    option = parser.add_argument
+    command.add_frames(parser)
+    command.add_dish(parser)
+    diameter = "inner diameter of the dish [m]"
+    option("--dish-diameter", type=command.number_argument(0.005, 0.5), required=True, metavar="D", help=diameter)
+    markers = "of the ArUco markers around the dish [m] (default: by the dish's rim)"
+    option("--markers", type=command.number_argument(1e-3, 2.0), nargs=2, metavar=("SPACING", "SIDE"), help=markers)
+    needle = "measure the needle's length too: its length, known within 10 %%, and the width of its body [m]"
+    option("--needle", type=command.number_argument(5e-5, 0.05), nargs=2, metavar=("LENGTH", "WIDTH"), help=needle)
+    option("--output", type=command.output_file, required=True, metavar="FILE", help="parameter file to write")
+
+
+def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal) -> int:
+    """Find where the dish is in the camera's image.
+
+    The result is its centre, the scale and, by markers, the rotation. FILE gets a section vision_tracker of a ROS 2
+    parameter file.
+
+    Without --markers the dish is found as by `track`, in the median of all frames. With --markers, ArUco markers
+    4x4_50 lie around the dish, their centres SPACING apart on a square around its centre: 0 at the top left, then
+    clockwise, all upright.
+
+    With --needle the needle's length is measured over eight frames that show both of its ends, and written for every
+    node.
+    """
+    by_markers = options.markers is not None
+    if by_markers and (options.region or options.rim):
+        raise BagError(options.frames[0], "is calibrated by --markers, so --region and --rim have no meaning for it")
+    source = open_frames(options, terminal.log)
+    every = max(1, -(-source.count // MAX_FRAMES))  # evenly over a long bag or video
+    images, unused = [], ""
+    for frame in islice(source.frames, 0, None, every):
+        if frame.image is None:
+            continue
+        if (problem := frame.lens_problem) is not None:
+            if options.camera_info is not None:
+                raise problem
+            unused = f"{problem}; it is not used"
+        images.append(frame.undistorted())
+        if len(images) == MAX_FRAMES:  # of a video that does not say how many it has
+            break
+    source.log_refused(terminal.log)
+    if unused:
+        terminal.log(unused)
+    if not images:
+        why = "; ".join(problem for problem, _ in source.refused.most_common(3))
+        raise BagError(options.frames[0], f"holds no frame that can be read: {why}")
+    if by_markers:
+        result = calibrate_by_markers(images, options.dish_diameter, *options.markers)
+    else:
+        looked = VisionTrackerSettings(region_px=tuple(options.region or ()), rim=options.rim or "")
+        result = calibrate_by_dish(images, options.dish_diameter, looked)
+    if options.needle is not None:
+        result = replace(result, needle_length=measure_needle_length(images, result, *options.needle))
+    with whole_file(options.output) as partial:
+        head = f"# UNVERIFIED: {one_line(source.unverified)}\n" if source.unverified else ""
+        partial.write_text(head + result.to_yaml(), encoding="utf-8")
+    u, v = result.view.centre_px
+    scale, turned = result.view.metres_per_pixel * 1e3, result.view.rotation
+    terminal.log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
+    by = f"the dish's rim, scale within {100.0 * result.scale_error:.2g} %"
+    by = f"markers, residual {result.residual_px:.2f} px" if by_markers else by
+    terminal.log(f"by {by}; {result.frames} frames, scatter {result.scatter_px:.2f} px")
+    if result.remark:
+        terminal.log(result.remark)
+    if result.needle_length is not None:
+        terminal.log(f"the needle is {1e3 * result.needle_length:.3f} mm long")
+    terminal.log(f"parameters: {options.output}")
+    return command.DONE
+
+
+def add_coils(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    command.runs(parser, run_calibrate_coils)
+    option = parser.add_argument
+    option("measurements", type=Path, metavar="MEASUREMENTS", help="CSV file")
+    option("--output", type=command.output_file, required=True, metavar="FILE", help="calibration to write (YAML)")
+    option("--name", default="", metavar="RIG", help="the rig's name (default: the file's)")
+
+
+def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal) -> int:
+    """Find the coils' properties from probe measurements.
+
+    The model of the coils is fitted to what a probe measured in the dish, and written as a calibration, which the
+    parameter `calibration` of coil_bridge names. MEASUREMENTS is a CSV file with the header
+
+      coil,current,x,y,bx,by
+
+    in A, m and T, in the dish frame: one coil on at a time, by its index or name, the probe all over the dish,
+    ten places or more for each coil. Some lines with a current of 0 tell the background of earth and probe
+    apart, and so do both directions of current.
+    """
+    fit = fit_calibration(read_measurements(options.measurements))
+    x, y = fit.background
+    if math.hypot(x, y) > 1e-3:  # T; that of the earth is a twentieth of it
+        text = f"a background of {1e3 * math.hypot(x, y):.3g} mT"
+        raise InvalidInputError(str(options.measurements), text, "at most 1 mT; are all fields in T?")
+    notes = f"from {fit.readings} readings in {options.measurements.name}, residual {fit.residual:.2e} T"
+    named = {"name": options.name or options.output.stem, "date": datetime.date.today().isoformat()}
+    calibration = replace(fit.calibration, notes=f"{notes}, background {x:.2e}, {y:.2e} T", **named)
+    with whole_file(options.output) as partial:
+        partial.write_text(calibration.to_yaml(), encoding="utf-8")
+    figures = replace(fit, calibration=calibration).to_json()
+    terminal.print(_coil_table(figures))
+    line, worst = figures["worst"]
+    residual = f"{fit.readings} readings, residual {1e6 * fit.residual:.1f} µT"
+    terminal.log(f"{residual}, background {1e6 * x:.1f}, {1e6 * y:.1f} µT")
+    terminal.log(f"the largest difference, {1e6 * worst:.1f} µT, is in line {line}")
+    for coil in figures["coils"]:
+        if coil["poor"]:
+            terminal.log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")
+    terminal.log(f"calibration: {options.output}")
+    return command.DONE
+
+
+def _coil_table(fit: dict[str, Any]) -> Table:
+    """Return a row for each coil, as `CalibrationFit.to_json` gives them."""
+    names = ("coil", "angle [deg]", "distance [mm]", "radius [mm]", "field [mT/A]", "residual [uT]")
+    columns = (("angle", math.degrees(1.0), 2), ("distance", 1e3, 2), ("radius", 1e3, 2), ("field_per_current", 1e3, 4))
+    rows = [
+        (coil["name"], *(_value(coil, *column) for column in columns), f"{1e6 * coil['residual']:.1f}")
+        for coil in fit["coils"]
+    ]
+    caption = "with standard deviations; ? is poorly determined"
+    return command.make_table(f"coils as {fit['model']}", names, rows, caption)
+
+
+def _value(coil: dict[str, Any], key: str, scale: float, digits: int) -> str:
+    deviation = coil["deviations"][key]
+    if math.isnan(deviation):
+        return "-"
+    mark = " ?" if key in coil["poor"] else ""
+    return f"{scale * coil[key]:.{digits}f} ± {scale * deviation:.{digits}f}{mark}"

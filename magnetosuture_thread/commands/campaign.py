@@ -67,39 +67,38 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
     setup = read_procedure_setup(procedure, options.setup)
     run.check_run(procedure, setup, run.vary(setup, seeds[0]))
-    result = CampaignResult(procedure, setup, options.camera, bags={seed: f"bags/seed_{seed}" for seed in bags})
+    result = CampaignResult(procedure, setup, options.camera)
     work = partial(_run, procedure, setup, setup.path.read_text(encoding="utf-8"), options.camera)
     with (
         terminal.progress("campaign") as advance,
         whole_folder(options.output) as folder,
         TaskRunner(work, options.workers, options.scheduler) as runner,
     ):
-        tasks = [(seed, folder / result.bags[seed] if seed in bags else None) for seed in seeds]
-        found: dict[int, run.RunResult] = {}
-        for index, made in runner.run(tasks, terminal.log, advance):
+        tasks = [(seed, folder / "bags" / f"seed_{seed}" if seed in bags else None) for seed in seeds]
+        for index, outcome in runner.run(tasks, terminal.log, advance):
             seed = seeds[index]
-            if isinstance(made, WorkerDiedError):
-                result.died[seed] = str(made)
-                terminal.log(f"seed {seed}: {made}")
+            if isinstance(outcome, WorkerDiedError):
+                result.died[seed] = str(outcome)
+                terminal.log(f"seed {seed}: {outcome}")
                 continue
-            found[seed], used_time = made
-            speed = found[seed].simulated_s / used_time
-            terminal.log(f"seed {seed}: {found[seed].reason or 'success'} ({speed:.1f} times real time)")
-        result.runs.extend(found[seed] for seed in seeds if seed in found)
-        rows = [each.to_json() for each in result.runs]
+            seed_run, used_time = outcome
+            result.runs.append(seed_run)
+            speed = seed_run.simulated_s / used_time
+            terminal.log(f"seed {seed}: {seed_run.reason or 'success'} ({speed:.1f} times real time)")
+        result.runs.sort(key=lambda seed_run: seed_run.seed)
+        rows = [seed_run.to_json() for seed_run in result.runs]
         for ending in ("json", "csv"):
             write_table(folder / f"campaign.{ending}", rows, result.to_json())
         if picture := picture_or_log(partial(draw_campaign, result), terminal.log):
             (folder / "campaign.png").write_bytes(picture)
-    title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
     columns = ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]")
     cells = []
-    for each in result.runs:
-        figures, clearance = each.figures, 1e3 * each.figures.min_needle_clearance_m
-        times = (f"{figures.time_s:.1f}", f"{figures.ideal_time_s:.1f}", f"{clearance:.3f}")
-        others = (f"{figures.longest_rest_s:.2f}", f"{figures.wrap_degrees:.0f}")
-        cells.append((str(each.seed), "yes" if each.success else "no", str(each.goals_met), *times, *others))
-    terminal.print(command.make_table(f"{title} (simulated)", columns, cells, left=0))
+    for seed_run in result.runs:
+        figures, clearance = seed_run.figures, f"{1e3 * seed_run.figures.min_needle_clearance_m:.3f}"
+        times = (f"{figures.time_s:.1f}", f"{figures.ideal_time_s:.1f}", clearance, f"{figures.longest_rest_s:.2f}")
+        counts = (str(seed_run.seed), "yes" if seed_run.success else "no", str(seed_run.goals_met))
+        cells.append((*counts, *times, f"{figures.wrap_degrees:.0f}"))
+    terminal.print(command.make_table(f"{result.title} (simulated)", columns, cells, left=0))
     terminal.log(f"results: {options.output}")
     return command.FAILED if result.died else command.DONE
 
@@ -114,7 +113,6 @@ class CampaignResult:
         camera: whether frames were rendered and tracked.
         runs: in the order of their seeds.
         died: seeds whose process ended early, and why.
-        bags: seeds of which there is a bag, with its folder beside the page.
     """
 
     procedure: Procedure
@@ -122,17 +120,17 @@ class CampaignResult:
     camera: bool
     runs: list[run.RunResult] = field(default_factory=list)
     died: dict[int, str] = field(default_factory=dict)
-    bags: dict[int, str] = field(default_factory=dict)
 
     @property
     def successes(self) -> int:
         """Runs in which every goal was reached and every limit held."""
-        return sum(each.success for each in self.runs)
+        return sum(outcome.success for outcome in self.runs)
 
     @property
-    def min_clearance(self) -> float:
-        """Clearance of the needle's axis that a run has to keep [m]."""
-        return self.setup.coils.keep_out - run.KEEP_OUT_TOLERANCE
+    def title(self) -> str:
+        """What was run, and how often it succeeded."""
+        count = len(self.runs) + len(self.died)
+        return f"{self.procedure.name} on {self.setup.name}: {self.successes} of {count} runs succeeded"
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, in the unit that each name ends with."""
@@ -142,19 +140,16 @@ class CampaignResult:
             "camera": self.camera,
             "simulated": True,
             "successes": self.successes,
-            "runs": [each.to_json() for each in self.runs],
+            "runs": [outcome.to_json() for outcome in self.runs],
             "died": {str(seed): reason for seed, reason in self.died.items()},
         }
 
 
+Task = tuple[int, Path | None]  # seed, and folder of the bag if any
+
+
 def _run(
-    procedure: Procedure,
-    setup: Setup,
-    text: str,
-    camera: bool,
-    task: tuple[int, Path | None],
-    log: Log,
-    progress: Progress,
+    procedure: Procedure, setup: Setup, text: str, camera: bool, task: Task, log: Log, progress: Progress
 ) -> tuple[run.RunResult, float]:
     """Run one seed, with the folder of its bag if any; return what came of it, and its processor time [s]."""
     began, (seed, folder) = process_time(), task
@@ -165,8 +160,8 @@ def _run(
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
         recorder = None if bag is None else RunBag(bag, setup, camera=camera)
-        found = run.run_procedure(procedure, setup, run.vary(setup, seed), camera=camera, recorder=recorder)
-    return found, process_time() - began
+        result = run.run_procedure(procedure, setup, run.vary(setup, seed), camera=camera, recorder=recorder)
+    return result, process_time() - began
 
 
 def draw_campaign(result: CampaignResult) -> bytes:
@@ -177,40 +172,39 @@ def draw_campaign(result: CampaignResult) -> bytes:
     """
     from magnetosuture_thread.evaluation import plots  # late, as it imports matplotlib
 
-    failed = [each for each in result.runs if not each.success][:MAX_PANELS]
+    failed = [outcome for outcome in result.runs if not outcome.success][:MAX_PANELS]
     rows = -(-len(failed) // 4)
     height = 3.3 + 3.6 * rows
     figure = plots.make_figure(14.0, height)
-    count = len(result.runs) + len(result.died)
-    title = f"{result.procedure.name} on {result.setup.name}, simulated: {result.successes} of {count} runs succeeded"
-    words = "green: succeeded, red: failed; dashed: limit"
+    title, words = f"{result.title}, simulated", "green: succeeded, red: failed; dashed: limit"
     if failed:
-        words += "; below: failed runs at their end, magenta: thread, black: needle of the last seconds,"
         words += (
-            "\nred: where it was closest to wall or shape, orange: planned way of its middle, arrow: commanded velocity"
+            "; below: failed runs at their end, magenta: thread, black: needle of the last seconds,\n"
+            "red: where it was closest to wall or shape, orange: planned way of its middle, arrow: commanded velocity"
         )
     for text, below, size in ((title, 0.15, 14), (words, 0.5, 9.5)):
         figure.text(0.015, 1.0 - below / height, text, fontsize=size, color=plots.INK, va="top", parse_math=False)
-    colours = [plots.GOOD if each.success else plots.BAD for each in result.runs]
-    seeds = [each.seed for each in result.runs]
+    colours = [plots.GOOD if outcome.success else plots.BAD for outcome in result.runs]
+    seeds = [outcome.seed for outcome in result.runs]
+    keep_out = result.setup.coils.keep_out - run.KEEP_OUT_TOLERANCE
     panels = (
-        ("clearance of the needle's axis [mm]", "min_needle_clearance_m", 1e3, result.min_clearance),
+        ("clearance of the needle's axis [mm]", "min_needle_clearance_m", 1e3, keep_out),
         ("longest rest [s]", "longest_rest_s", 1.0, run.MAX_REST),
         ("depth of a node in wall or shape [µm]", "max_thread_penetration_m", 1e6, run.PENETRATION_TOLERANCE),
         ("peak tension [mN]", "max_tension_n", 1e3, np.nan),
     )
     for column, (title, name, scale, limit) in enumerate(panels):
         axes = figure.add_axes((0.035 + 0.25 * column, 1.0 - 2.8 / height, 0.2, 1.7 / height))
-        axes.scatter(seeds, [scale * getattr(each.figures, name) for each in result.runs], c=colours, s=22)
+        axes.scatter(seeds, [scale * getattr(outcome.figures, name) for outcome in result.runs], c=colours, s=22)
         axes.axhline(scale * limit, color=plots.FAINT, linewidth=0.9, linestyle=(0, (4, 3)))
         axes.set_title(title, fontsize=9.5, color=plots.INK, loc="left")
         axes.set_xlabel("seed", fontsize=8.5, color=plots.INK, labelpad=1)
         plots.tidy(axes)
-    for index, each in enumerate(failed):
+    for index, outcome in enumerate(failed):
         row, column = divmod(index, 4)
         axes = figure.add_axes((0.01 + 0.2475 * column, (3.6 * (rows - 1 - row) + 0.05) / height, 0.24, 3.1 / height))
-        axes.set_title(f"seed {each.seed}: {shortened(each.reason, 38)}", fontsize=9, color=plots.INK, loc="left")
-        _draw_failed_run(axes, each, result)
+        axes.set_title(f"seed {outcome.seed}: {shortened(outcome.reason, 38)}", fontsize=9, color=plots.INK, loc="left")
+        _draw_failed_run(axes, outcome, result)
     return plots.to_png(figure)
 
 
@@ -229,6 +223,5 @@ def _draw_failed_run(axes: Axes, failed: run.RunResult, result: CampaignResult) 
         if end.path is not None:
             axes.plot(*(1e3 * end.path.T), color="#f28c28", linewidth=1.0, linestyle=(0, (4, 2)))
         length = float(np.linalg.norm(end.axis[-1] - end.axis[0]))  # of the arrow at the allowed speed
-        plots.draw_arrow(
-            axes, 1e3 * end.axis[-1], 1e3 * length / result.procedure.limits[0].speed * end.frame.commanded
-        )
+        scale = 1e3 * length / result.procedure.limits[0].speed
+        plots.draw_arrow(axes, 1e3 * end.axis[-1], scale * end.frame.commanded)

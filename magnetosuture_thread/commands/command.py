@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -67,9 +66,9 @@ def add_actions(
     parsers = []
     for name, run in actions.items():
         summary = (inspect.getdoc(run) or "").partition("\n")[0].rstrip(".")
-        own = subparsers.add_parser(name.replace("_", "-"), help=summary[:1].lower() + summary[1:])
-        runs(own, run)
-        parsers.append(own)
+        subparser = subparsers.add_parser(name.replace("_", "-"), help=summary[:1].lower() + summary[1:])
+        runs(subparser, run)
+        parsers.append(subparser)
     return parsers
 
 
@@ -229,40 +228,31 @@ class _PlainConsole(Console):
             yield segment if control or text.isprintable() else Segment(printable(text), style)
 
 
-def make_console(*, errors: bool = False) -> Console:
-    """Return the console of a command: numbers and paths in no colours of their own, control characters escaped.
-
-    Args:
-        errors: whether it writes to standard error, in place of standard output.
-    """
-    return _PlainConsole(highlight=False, emoji=False, stderr=errors, soft_wrap=errors)
-
-
-def make_log(console: Console) -> Callable[[str], None]:
-    """Return what prints a line as it is, however long."""
-    return lambda text: console.print(text, soft_wrap=True, markup=False)
-
-
-@contextmanager
-def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
-
-
 class Terminal:
     """What a command shows while it runs and when it is done.
 
+    Args:
+        errors: whether it writes to standard error, in place of standard output.
+
     Attributes:
-        log: called with a line for a person, which is printed as it is, however long.
         print: called with a table.
-        progress: shows a progress bar of a name; see `progress`.
     """
 
-    def __init__(self) -> None:
-        console = make_console()
-        self.log, self.print, self.progress = make_log(console), console.print, partial(progress, console)
+    def __init__(self, *, errors: bool = False) -> None:
+        # Numbers and paths have no colours of their own.
+        self._console = _PlainConsole(highlight=False, emoji=False, stderr=errors, soft_wrap=errors)
+        self.print = self._console.print
+
+    def log(self, text: str) -> None:
+        """Print a line for a person as it is, however long."""
+        self._console.print(text, soft_wrap=True, markup=False)
+
+    @contextmanager
+    def progress(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
+        with Progress(console=self._console, transient=True) as bar:
+            task = bar.add_task(name, total=1.0)
+            yield lambda share: bar.update(task, completed=share)
 
 
 def make_table(
@@ -280,9 +270,9 @@ def make_table(
     table = Table(title=title, caption=caption or None, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")
     for index, name in enumerate(columns):
         if index < left:
-            table.add_column(name, overflow="fold", min_width=min(12, 12 - 6 * index))
+            table.add_column(Text(name), overflow="fold", min_width=min(12, 12 - 6 * index))
         else:
-            table.add_column(name, justify="right", no_wrap=True)
+            table.add_column(Text(name.replace(" [", "\n[")), justify="right", no_wrap=True)  # the unit below
     for row in rows:
         table.add_row(*map(Text, row))
     return table

@@ -9,7 +9,8 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -96,8 +97,8 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
             source = None
             if options.replay is not None:
                 source = live.GraphInput(stack.enter_context(open_bag(options.replay, log, setup_name=options.setup)))
-                source.given.check_loop()
-            shown = settings(read_setup(name) if source is None else source.given.setup)
+                source.bag.check_loop()
+            shown = settings(read_setup(name) if source is None else source.bag.setup)
             shown = replace(shown, image_transport=source.transport) if source and source.transport else shown
             logs, domain = Path(stack.enter_context(TemporaryDirectory())), stack.enter_context(live.own_domain())
             page = stack.enter_context(Participant(NAME, domain=domain, simulated_clock=source is not None))
@@ -139,10 +140,8 @@ class BagRecording:
     ) -> None:
         self.output, self._notes = output, notes
         self._inboxes = [Inbox(graph.node, topic, 1000) for topic in recorded]
-        self._begun, self._ending = asyncio.Event(), threading.Event()
-        loop = asyncio.get_running_loop()
-        writing = asyncio.to_thread(self._write, lambda: loop.call_soon_threadsafe(self._begun.set))
-        self._writing = asyncio.create_task(writing)
+        self._begun, self._ending = Future[None](), threading.Event()
+        self._writing = asyncio.create_task(asyncio.to_thread(self._write))
 
     @property
     def ended(self) -> bool:
@@ -155,9 +154,8 @@ class BagRecording:
         Raises:
             BagError: the output exists or cannot be written.
         """
-        begun = asyncio.create_task(self._begun.wait())
+        begun = asyncio.wrap_future(self._begun)
         await asyncio.wait((begun, self._writing), return_when=asyncio.FIRST_COMPLETED)
-        begun.cancel()
         if self.ended:
             await self.end()
 
@@ -174,14 +172,14 @@ class BagRecording:
         self._inboxes = []
         self._writing.result()
 
-    def _write(self, begun: Callable[[], object]) -> None:
+    def _write(self) -> None:
         with (
             whole_folder(self.output, is_recording=True) as folder,
             BagWriter(folder, self._notes, name=self.output.name) as bag,
         ):
             for inbox in self._inboxes:
                 bag.add_topic(inbox.topic.channel.recorded, inbox.topic.channel.type_name)
-            begun()
+            self._begun.set_result(None)
             ending = False
             while not ending:
                 ending = self._ending.wait(0.01)
@@ -193,8 +191,8 @@ class BagRecording:
 def new_name(folder: Path, name: str) -> Path:
     """Return a folder that does not exist yet for a recording, named by the time and the setup."""
     stem = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}".rstrip("_")
-    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
-    return next(folder / each for each in names if not (folder / each).exists())
+    endings = itertools.chain([""], (f"_{number}" for number in itertools.count(2)))
+    return next(path for ending in endings if not (path := folder / f"{stem}{ending}").exists())
 
 
 class RecordingHost(GraphHost):
@@ -216,8 +214,8 @@ class RecordingHost(GraphHost):
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
         recording = "" if self._recording is None else str(self._recording.output)
-        own = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
-        return {**super().state(), **own}
+        state = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
+        return {**super().state(), **state}
 
     def notes(self, operator: str) -> dict[str, str]:
         """Return the notes of a recording, which the page that has control began.
@@ -226,10 +224,8 @@ class RecordingHost(GraphHost):
             operator: who commands that page.
         """
         notes = {"setup": self.setup.name, SETUP_NOTE: self.setup.path.read_text(encoding="utf-8")}
-        if self.graph.is_active(RIG):
-            what = f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
-            notes["simulated"] = what
-        return notes
+        what = f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
+        return {**notes, **({"simulated": what} if self.graph.is_active(RIG) else {})}
 
     def start(self) -> None:
         """Start what this runs; here nothing."""
@@ -270,10 +266,9 @@ class RecordingHost(GraphHost):
 
     async def _end_recording(self) -> str:
         """End the recording, if there is one; return the problem if it is not complete."""
-        recording = self._recording
+        recording, problem = self._recording, ""
         if recording is None:
             return ""
-        problem = ""
         try:
             await recording.end()
         except MagnetosutureError as error:
@@ -311,8 +306,8 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *live.OWN, *live.FORECAST]
-        arguments += ["-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active"]  # a person arms it
+        bridge = live.arguments_of({"coil_bridge:driver": "simulated", "coil_bridge:autostart": "active"})
+        arguments = ["--params-file", str(self.setup.path.resolve()), *live.OWN, *live.FORECAST, *bridge]  # to be armed
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
         self._nodes = NodeProcesses(processes, arguments, dict(os.environ), self._logs).__enter__()
@@ -350,7 +345,7 @@ class SimulatedHost(RecordingHost):
         if not self.busy:
             return
         nodes = self.graph.nodes().items()
-        live.log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
+        live.log_compiling({name: report["message"] for name, report in nodes}, self._logged, self.log)
         missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
@@ -390,18 +385,18 @@ class ReplayHost(RecordingHost):
     mode = "replay"
 
     def __init__(self, graph: ConsoleGraph, source: live.GraphInput, domain: int, logs: Path, log: Log) -> None:
-        super().__init__(graph, source.given.setup, Path(), log)
+        super().__init__(graph, source.bag.setup, Path(), log)
         self._source, self._domain = source, domain
         arguments = source.arguments(logs / "lossless.yaml")
         self._nodes = NodeProcesses(source.processes, arguments, dict(os.environ), logs)
         self._ending = threading.Event()
         self._playing: asyncio.Task[None] | None = None
-        self.busy = f"starting the nodes for {source.given.recording.path}"
+        self.busy = f"starting the nodes for {source.bag.recording.path}"
         graph.blocked = "this is a replay: nothing can be jogged or armed"
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
-        recording = self._source.given.recording
+        recording = self._source.bag.recording
         simulated = bool(recording.notes.get("simulated", ""))
         return {**super().state(), "setup": str(recording.path), "can_record": False, "simulated": simulated}
 

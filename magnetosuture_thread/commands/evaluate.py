@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,22 +143,21 @@ def evaluate_bags(
     if setup_name := selection.get("setup_name"):
         read_setup(setup_name)  # refuses what is wrong for all before anything is done
     bags = find_bags(paths)
-    names = numbered([name_of(bag) for bag in bags], "{}-{}")
-    tasks = [
-        EvaluationTask(bag, name, against, formulation, selection, output is not None)
-        for bag, name in zip(bags, names, strict=True)
-    ]
+    tasks = list(zip(bags, numbered([name_of(bag) for bag in bags], "{}-{}"), strict=True))
+    work = partial(
+        evaluate_one, against=against, formulation=formulation, selection=selection, is_drawn=output is not None
+    )
     rows: dict[int, Row] = {}
     with ExitStack() as stack:
         folder = stack.enter_context(whole_folder(output)) if output is not None else None
-        runner = stack.enter_context(TaskRunner(evaluate_one, workers, scheduler))
+        runner = stack.enter_context(TaskRunner(work, workers, scheduler))
         for index, result in runner.run(tasks, log, progress):
-            task = tasks[index]
-            row, picture = (_failed(task, str(result)), b"") if isinstance(result, WorkerDiedError) else result
+            bag, name = tasks[index]
+            row, picture = (_failed(bag, name, str(result)), b"") if isinstance(result, WorkerDiedError) else result
             if row["problem"]:
-                log(f"{task.name}: {row['problem']}")
+                log(f"{name}: {row['problem']}")
             if folder is not None and picture:
-                (folder / f"{task.name}.png").write_bytes(picture)
+                (folder / f"{name}.png").write_bytes(picture)
             rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
         if folder is not None:
@@ -166,70 +165,65 @@ def evaluate_bags(
     return ordered
 
 
-@dataclass(frozen=True)
-class EvaluationTask:
-    """A bag to evaluate.
+def evaluate_one(
+    task: tuple[Path, str],
+    log: Log,
+    progress: Progress,
+    *,
+    against: str,
+    formulation: str,
+    selection: BagSelection,
+    is_drawn: bool,
+) -> tuple[Row, bytes]:
+    """Return the row of a bag and its picture, empty if none is asked for; see `evaluate_bags`.
 
-    Attributes:
-        path: of the bag.
-        name: of its row and picture.
-        against: what predictions are compared with: `truth`, `seen` (measured), or `auto`: both where present.
-        formulation: of the model; the setup's if empty.
+    With a problem in the row there is no picture: nothing stops the others.
+
+    Args:
+        task: path of the bag, and name of its row and picture.
+        log: called with a line for a person.
+        progress: called with the share done, 0 to 1.
+        against: what predictions are compared with.
+        formulation: of the model.
         selection: what of the bag is read.
         is_drawn: whether a picture is drawn.
     """
+    path, name = task
 
-    path: Path
-    name: str
-    against: str
-    formulation: str
-    selection: BagSelection
-    is_drawn: bool
+    def log_named(text: str) -> None:
+        log(f"{name}: {text}")
 
-
-def evaluate_one(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, bytes]:
-    """Return the row of a bag and its picture; with a problem in the row, there is none: nothing stops the others."""
     try:
-        return _evaluate_bag(task, lambda text: log(f"{task.name}: {text}"), progress)
+        with open_bag(path, log_named, **selection) as bag:
+            recording, model = bag.recording, bag.setup.model
+            model = replace(model, formulation=formulation or model.formulation)
+            run = measure_run(bag, model, _targets(bag, against), progress)
+            if run.remark:
+                log_named(run.remark)
+            row = tables.row_of(
+                run.metrics,
+                run.silence,
+                recorded_latency(recording, bag.start, bag.duration),
+                bag=name,
+                path=one_line(str(recording.path)),
+                setup=bag.setup.name,
+                simulated=recording.notes.get("simulated", ""),
+                source=bag.source,
+                formulation=model.formulation,
+                duration_s=bag.duration,
+                damage="; ".join(map(str, recording.damage.regions)) if recording.damage else "",
+                unverified=recording.salvaged_without_checksum,
+                refused=sum(count for why, count in run.refused.items() if why != NOT_FOUND),
+            )
+            return row, draw_run(bag, run.metrics, log_named) if is_drawn else b""
     except MagnetosutureError as error:
-        return _failed(task, str(error)), b""
+        return _failed(path, name, str(error)), b""
     except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
-        return _failed(task, f"{type(error).__name__}: {error}"), b""
+        return _failed(path, name, f"{type(error).__name__}: {error}"), b""
 
 
-def _failed(task: EvaluationTask, problem: str) -> Row:
-    return tables.failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
-
-
-def _evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, bytes]:
-    """Evaluate a bag; return its row of the table, and its picture, empty if none is asked for.
-
-    Raises:
-        BagError: the bag cannot be used, what is compared with is not in it, or nothing in it was predicted.
-        ConfigurationError: the setup cannot be used.
-    """
-    with open_bag(task.path, log, **task.selection) as bag:
-        recording, model = bag.recording, bag.setup.model
-        model = replace(model, formulation=task.formulation or model.formulation)
-        run = measure_run(bag, model, _targets(bag, task.against), progress)
-        if run.remark:
-            log(run.remark)
-        row = tables.row_of(
-            run.metrics,
-            run.silence,
-            recorded_latency(recording, bag.start, bag.duration),
-            bag=task.name,
-            path=one_line(str(recording.path)),
-            setup=bag.setup.name,
-            simulated=recording.notes.get("simulated", ""),
-            source=bag.source,
-            formulation=model.formulation,
-            duration_s=bag.duration,
-            damage="; ".join(str(region) for region in recording.damage.regions) if recording.damage else "",
-            unverified=recording.salvaged_without_checksum,
-            refused=sum(count for why, count in run.refused.items() if why != NOT_FOUND),
-        )
-        return row, draw_run(bag, run.metrics, log) if task.is_drawn else b""
+def _failed(path: Path, name: str, problem: str) -> Row:
+    return tables.failed_row(name, one_line(str(path)), one_line(" ".join(problem.split())))
 
 
 def _targets(bag: BagInput, against: str) -> list[str]:
@@ -267,26 +261,24 @@ def find_bags(paths: Iterable[Path], depth: int = 2) -> list[Path]:
     bags: dict[Path, Path] = {}
     for path in paths:
         inside = _bags(path, depth)
+        if not inside:
+            raise BagError(path, f"holds no bags ({' or '.join(STORAGE_SUFFIXES)}), nor do the folders in it")
         for bag in inside:
             bags.setdefault(bag.resolve(), bag)
-        if not inside:
-            endings = " or ".join(STORAGE_SUFFIXES)
-            raise BagError(path, f"holds no bags ({endings}), nor do the folders in it")
     return list(bags.values())
 
 
 def _bags(path: Path, depth: int) -> list[Path]:
     try:
-        if not path.exists():
+        inside = sorted(path.iterdir()) if path.is_dir() else []
+        is_file = not inside and path.is_file()
+        if not (inside or path.exists()):
             raise BagError(path, "does not exist; expected a bag, a folder of bags, or reference trajectories")
-        if path.is_file():
-            return [path]
-        inside = sorted(path.iterdir())
     except BagError:
         raise
     except Exception as error:  # The file system of a URL raises whatever its library does.
         raise BagError(path, f"cannot be read: {error}") from None
-    if any(file.name == METADATA_FILE for file in inside):
+    if is_file or any(file.name == METADATA_FILE for file in inside):
         return [path]
     files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
     folders = [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
@@ -332,15 +324,14 @@ def evaluate_references(options: argparse.Namespace, log: Log, progress: Progres
         if options.rig:
             evaluation = reference.score_rig(paths, **settings)
         else:
-            names: dict[str, Any] = {"formulation": options.formulation or "rod", "solver": options.solver or "banded"}
-            evaluation = reference.score(paths, **names, **settings)
+            formulation, solver = options.formulation or "rod", options.solver or "banded"
+            evaluation = reference.score(paths, formulation=formulation, solver=solver, **settings)
         if folder is not None:
             document = evaluation.to_mapping()
             tables.write_table(folder / "table.json", document["cases"], document)
             for case in cases:
                 if picture := picture_or_log(partial(_draw_case, case, evaluation.formulation), log):
-                    name = one_line(case.score.name).replace("/", "_")
-                    (folder / f"{name}.png").write_bytes(picture)
+                    (folder / f"{one_line(case.score.name).replace('/', '_')}.png").write_bytes(picture)
     return evaluation
 
 
@@ -362,12 +353,13 @@ def bags_table(rows: Sequence[Any]) -> Any:
             continue
         frames = f"{row['predicted']}/{row['frames']}"
         margin, step = _number(row["least_obstacle_m"], 1e6, " µm"), _number(row["step_median_s"], 1e3, " ms")
-        cells.append((name, frames, *_errors(row["estimate"]), margin, step))
-        cells.append(("  predicted", "", *_errors(row["prediction"])))
+        cells += [
+            (name, frames, *_errors(row["estimate"]), margin, step),
+            ("  predicted", "", *_errors(row["prediction"])),
+        ]
     if len(rows) > 1:
-        compared = tables.compare_bags(rows)
-        cells.append(("all bags", "", *_errors(compared["estimate"])))
-        cells.append(("  predicted", "", *_errors(compared["prediction"])))
+        of_all = tables.compare_bags(rows)
+        cells += [("all bags", "", *_errors(of_all["estimate"])), ("  predicted", "", *_errors(of_all["prediction"]))]
     caption = (
         "errors in % of the length, mean and maximum over time; margin: least clearance of an obstacle, chords too"
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -44,11 +44,16 @@ START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machi
 POLL_PERIOD = 0.02  # s between two looks at the nodes
 TOO_SLOW = "machine too slow"
 
-# Arguments for the nodes, after `--ros-args`. Whatever a setup says for a launch, nobody would activate the nodes of a
-# command.
-OWN = [part for name in interface.STANDBY_NODES for part in ("-p", f"{name}:autostart:=active")]
+
+def arguments_of(parameters: Mapping[str, object]) -> list[str]:
+    """Return arguments for nodes, after `--ros-args`, from parameters by name, as `coil_bridge:driver`."""
+    return [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+
+
+# Whatever a setup says for a launch, nobody would activate the nodes of a command.
+OWN = arguments_of({f"{name}:autostart": "active" for name in interface.STANDBY_NODES})
 # Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
-FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
+FORECAST = arguments_of({"thread_model:forecast_horizon": 3.0, "thread_model:forecast_period": 0.2})
 
 
 @contextmanager
@@ -62,8 +67,7 @@ def own_domain() -> Iterator[int]:
         yield domain
 
 
-@dataclass(frozen=True)
-class OwnGraph:
+class OwnGraph(NamedTuple):
     """Nodes that run in a ROS domain of their own.
 
     Attributes:
@@ -122,26 +126,26 @@ class GraphInput:
     """Messages of a bag to play into running nodes, and how these nodes are started.
 
     Args:
-        given: the bag and its setup.
+        bag: and its setup.
 
     Attributes:
-        given: as given.
+        bag: and its setup.
         transport: how the bag has its camera frames, raw or compressed; empty where poses are played.
         nodes: names of the graph's nodes; poses are played without a tracker.
         processes: programs that these nodes run as.
         channels: that are played.
     """
 
-    def __init__(self, given: recorded.BagInput) -> None:
-        self.given = given
-        camera = given.recording.camera if given.source == "camera" else None
+    def __init__(self, bag: recorded.BagInput) -> None:
+        self.bag = bag
+        camera = bag.recording.camera if bag.source == "camera" else None
         self.transport = next((transport for transport, channel in interface.CAMERA.items() if channel == camera), "")
         self.nodes = tuple(name for name in interface.NODES if self.transport or name != "vision_tracker")
         self.processes = interface.PROCESSES if self.transport else self.nodes
         poses = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
         source = (camera, interface.CAMERA_INFO, interface.NEEDLE_TIP) if camera is not None else poses
         possible = (*source, interface.NEEDLE_COMMAND, interface.MATERIAL)
-        counts = given.recording.counts
+        counts = bag.recording.counts
         self.channels = [interface.SCENE, *(channel for channel in possible if counts.get(channel.recorded))]
 
     def arguments(self, qos: Path) -> list[str]:
@@ -151,29 +155,28 @@ class GraphInput:
             qos: a file that this writes: parameters under which no message is lost; `scene.yaml` is written beside it.
         """
         qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
-        files = [part for path in (self.given.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
+        files = [part for path in (self.bag.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
         # Nodes begin in the scene that is played, also where the setup's file names one of another machine.
         scene = qos.with_name("scene.yaml")
-        write_scene(self.given.setup.scene, scene)
-        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *OWN]
+        write_scene(self.bag.setup.scene, scene)
+        parameters: dict[str, object] = {"scene": scene.resolve(), "use_sim_time": "true"}
         # A replayed bag never moves a needle, so its bridge may arm itself.
-        arguments += ["-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed"]
+        parameters |= {"coil_bridge:driver": "recording", "coil_bridge:autostart": "armed"}
         if self.transport:
-            arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
-        return arguments
+            parameters["vision_tracker:image_transport"] = self.transport
+        return [*files, *OWN, *arguments_of(parameters)]
 
     def records(self) -> Iterator[RecordedMessage]:
-        """Give the messages to play, by time."""
-        given = self.given
+        """Yield the messages to play, by time."""
+        bag = self.bag
         # The scene comes first: the one that is in force in the bag, or else the setup's.
-        data = packed_scene(given.begin, given.setup.scene)
-        yield RecordedMessage(interface.SCENE.recorded, interface.SCENE.type_name, given.begin, data)
-        if given.start > 0.0:  # what came before about the thread is in force
+        version, data = bag.setup.scene.version, packed_scene(bag.begin, bag.setup.scene)
+        yield RecordedMessage(interface.SCENE.recorded, interface.SCENE.type_name, bag.begin, data)
+        if bag.start > 0.0:  # what came before about the thread is in force
             earlier = [channel for channel in recorded.CHANGING if channel != interface.SCENE]
-            for record in given.recording.records(earlier, duration=given.start):
-                yield replace(record, time=given.begin)
-        version = given.setup.scene.version
-        for record in given.recording.records(self.channels, start=given.start, duration=given.duration):
+            for record in bag.recording.records(earlier, duration=bag.start):
+                yield replace(record, time=bag.begin)
+        for record in bag.recording.records(self.channels, start=bag.start, duration=bag.duration):
             if record.topic == interface.SCENE.recorded:
                 before, version = version, str(record.decode().version)
                 if version == before:
@@ -187,8 +190,8 @@ class GraphInput:
         known = (*topics.INPUTS, *topics.SETTINGS, *topics.OUTPUTS)
         return LiveReplay(
             domain,
-            Timeline(self.given.begin, rate),
-            bag_start=self.given.recording.start,
+            Timeline(self.bag.begin, rate),
+            bag_start=self.bag.recording.start,
             played=[topic for topic in known if topic.channel in self.channels],
             nodes=len(self.nodes),
             receive=receive,
@@ -228,47 +231,42 @@ def replay_live(
         GraphError: a node ended or did not come, or nothing was predicted.
         KeyboardInterrupt: interrupted before the first pass was done.
     """
-    with recorded.open_bag(bag_path, log, **selection) as given:
+    with recorded.open_bag(bag_path, log, **selection) as bag:
         if loop:
-            given.check_loop()
-        checked = _check_poses(given, log)
+            bag.check_loop()
+        checked = _check_poses(bag, log)
         if rate < 1.0:
             log("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
         if rate > 1.0:
             log("played faster than recorded: latencies count what waits in the queues")
         problem = ""
         with whole_folder(output) as folder, TemporaryDirectory() as spare:
-            source = GraphInput(given)
+            source = GraphInput(bag)
             arguments, logs = source.arguments(Path(spare) / "lossless.yaml"), folder / "logs"
             with own_graph(source.processes, arguments, logs, ", ".join(source.nodes), log) as graph:
-                outputs = BagWriter(folder / "bag", given.notes)
+                outputs = BagWriter(folder / "bag", bag.notes)
                 for topic in (topics.SCENE, *topics.OUTPUTS):
                     outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
-                live = source.live(graph.domain, rate, outputs.write, graph.check, log)
-                try:
+                with closing(source.live(graph.domain, rate, outputs.write, graph.check, log)) as live:
                     with outputs, graph.interruption:
                         live.wait_for_graph()
                         speed = f" at {rate:g} times the speed" if rate != 1.0 else ""
-                        log(f"playing {given.duration:.1f} s{speed}")
+                        log(f"playing {bag.duration:.1f} s{speed}")
                         pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{interface.Service.PAUSE_REPLAY}"
                         log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
-                        live.play(source.records(), lambda time: progress(min(1.0, time / max(given.duration, 1e-9))))
+                        live.play(source.records(), lambda time: progress(min(1.0, time / max(bag.duration, 1e-9))))
                     log("evaluating the outputs")
-                    metrics, summary = _summary(given, folder, live, **checked)
-                    replay.write_results(folder, given, metrics, summary, log)
-                    if late := lateness(summary, given.setup.coils.pose_timeout, rate):
+                    metrics, summary = _summary(bag, folder, live, **checked)
+                    replay.write_results(folder, bag, metrics, summary, log)
+                    if late := lateness(summary, bag.setup.coils.pose_timeout, rate):
                         log(f"{TOO_SLOW}: {late}")
                     if loop:
                         log("the first pass is recorded and evaluated; playing on until Ctrl-C")
                         try:
-                            with graph.interruption:
+                            with suppress(KeyboardInterrupt), graph.interruption:
                                 live.play_on(source.records)
                         except GraphError as error:
                             problem = f"{error}; the first pass is in {output}"
-                        except KeyboardInterrupt:
-                            pass
-                finally:
-                    live.close()
     if problem:
         raise GraphError(problem)
     return summary
@@ -289,41 +287,38 @@ def lateness(summary: ReplaySummary, pose_timeout: float, rate: float) -> str:
     return f"predictions came {latency.p99:.2g} s late (99th percentile); {limit}; try --rate {0.5 * rate:g}"
 
 
-def _check_poses(given: recorded.BagInput, log: Log) -> dict[str, Any]:
+def _check_poses(bag: recorded.BagInput, log: Log) -> dict[str, Any]:
     """Check recorded poses and threads before any node starts; return `remark`, and what is `refused`."""
-    if given.source == "camera":
+    if bag.source == "camera":
         return {}
-    checked = given.observations()
-    for _ in checked:
+    observations = bag.observations()
+    for _ in observations:
         pass
-    if remark := checked.thread_problem():
+    if remark := observations.thread_problem():
         log(remark)
-    return {"remark": remark, "refused": dict(checked.refused)}
+    return {"remark": remark, "refused": dict(observations.refused)}
 
 
-def _summary(
-    given: recorded.BagInput, folder: Path, live: LiveReplay, **others: Any
-) -> tuple[RunMetrics, ReplaySummary]:
+def _summary(bag: recorded.BagInput, folder: Path, live: LiveReplay, **others: Any) -> tuple[RunMetrics, ReplaySummary]:
     """Compare the outputs with what the bag holds."""
-    collector = GraphCollector()
-    before, replayed = CurrentSeries(), CurrentSeries()
+    collector, before, replayed = GraphCollector(), CurrentSeries(), CurrentSeries()
     truth = interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL
-    expected = [c for c in (*truth, interface.CURRENTS) if given.recording.counts.get(c.recorded)]
-    for record in given.recording.records(expected, start=given.start, duration=given.duration):
+    expected = [c for c in (*truth, interface.CURRENTS) if bag.recording.counts.get(c.recorded)]
+    for record in bag.recording.records(expected, start=bag.start, duration=bag.duration):
         if record.topic == interface.CURRENTS.recorded:
             before.add(record.decode())
         else:
             collector.add(record.topic, record.decode())
-    made = Bag(folder / "bag")
-    for record in made.records(set(made.topics)):
+    outputs = Bag(folder / "bag")
+    for record in outputs.records(set(outputs.topics)):
         message = record.decode()
         collector.add(record.topic, message)
         if record.topic == interface.CURRENTS.recorded:
             replayed.add(message)
-    length, losses = given.setup.model.thread_length, live.losses
-    metrics = RunMetrics.of(length, collector.frames(), given.recording.start)
-    frames, things, channel = losses.frames_played, "frames", given.recording.camera
-    if given.source == "poses":
+    length, losses = bag.setup.model.thread_length, live.losses
+    metrics = RunMetrics.of(length, collector.frames(), bag.recording.start)
+    frames, things, channel = losses.frames_played, "frames", bag.recording.camera
+    if bag.source == "poses":
         frames, things, channel = losses.played[interface.NEEDLE_POSE.name], "poses", interface.NEEDLE_POSE
     if not len(metrics.series):
         health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
@@ -331,9 +326,9 @@ def _summary(
     commands = live.published.get(interface.NEEDLE_COMMAND.name, {})
     counts: dict[str, Any] = {"frames": frames, "tracked": collector.poses, "commands": len(commands)}
     counts |= {"driven": len(collector.applied & set(commands)), "dropped": losses.dropped()}
-    latency = stage_latencies(live.published, live.arrived, collector.applied)
-    stamps = live.published[channel.name] if channel is not None else ()
-    times = 1e-9 * (np.array([*stamps], dtype=np.int64) - given.recording.start).astype(np.float64)
-    others |= {"silence": SensorSilence.of(times, given.start, given.start + given.duration)}
-    currents = replayed.against(before)
-    return metrics, replay.replay_summary(given, metrics, **counts, latency=latency, currents=currents, **others)
+    others["latency"] = stage_latencies(live.published, live.arrived, collector.applied)
+    others["currents"] = replayed.against(before)
+    stamps = np.array([*(live.published[channel.name] if channel is not None else ())], dtype=np.int64)
+    times = 1e-9 * (stamps - bag.recording.start).astype(np.float64)
+    others["silence"] = SensorSilence.of(times, bag.start, bag.start + bag.duration)
+    return metrics, replay.replay_summary(bag, metrics, **counts, **others)

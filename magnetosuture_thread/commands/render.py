@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from magnetosuture_thread import Attachment, ConfigurationError, Disc
+from magnetosuture_thread import ConfigurationError, Disc
 from magnetosuture_thread.bags import packing
 from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
@@ -35,16 +35,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("reference", type=Path, metavar="REFERENCE", help="a reference trajectory (.npz)")
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
     option("--setup", required=True, metavar="NAME", help="a setup's name or YAML file")
-    option(
-        "--start", type=command.number_argument(0.0, 1e6), default=0.0, help="time in the trajectory to begin at [s]"
-    )
+    start = "time in the trajectory to begin at [s]"
+    option("--start", type=command.number_argument(0.0, 1e6), default=0.0, help=start)
     option("--duration", type=command.number_argument(1e-3, 1e6), help="[s] (default: to the trajectory's end)")
-    option(
-        "--rate",
-        type=command.number_argument(1.0, 240.0),
-        default=30.0,
-        help="frames, or poses, a second (default: 30)",
-    )
+    rate = "frames, or poses, a second (default: 30)"
+    option("--rate", type=command.number_argument(1.0, 240.0), default=30.0, help=rate)
     quality = "of the JPEG frames (default: 85)"
     option("--quality", type=int, choices=range(1, 101), default=85, metavar="1..100", help=quality)
     option("--seed", type=command.whole_number, default=0, help="of dust and noise (default: 0)")
@@ -63,11 +58,11 @@ def run_render(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """
     if options.noise and not options.poses:
         raise ConfigurationError("--noise", options.noise, "none without --poses")
-    given = command.given(options, "start", "duration", "rate", "quality", "seed")
-    given["pose_noise"] = options.noise if options.poses else None
+    chosen = command.given(options, "start", "duration", "rate", "quality", "seed")
+    chosen["pose_noise"] = options.noise if options.poses else None
     setup, reference = read_setup(options.setup), read_reference(options.reference)
     with terminal.progress("render") as advance:
-        frames = render_bag(reference, setup, options.output, progress=advance, **given)
+        frames = render_bag(reference, setup, options.output, progress=advance, **chosen)
     terminal.log(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
     return command.DONE
 
@@ -118,16 +113,9 @@ def render_bag(
     _check_setup(reference, setup)
     what = "camera frames and needle motion, rendered" if pose_noise is None else "needle poses and seen thread"
     notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
-    source: tuple[interface.Channel, ...] = (interface.NEEDLE_POSE, interface.MEASURED_THREAD)
-    if pose_noise is None:
-        source, messages = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO), _frames(setup, reference, quality, seed)
-    else:
-        messages = _poses(setup, pose_noise, seed)
-    motion = (interface.NEEDLE_COMMAND, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD)
-    channels = (*source, *motion)
+    measure = _frames(setup, reference, quality, seed) if pose_noise is None else _poses(setup, pose_noise, seed)
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
-        for channel in (interface.SCENE, *channels):
-            bag.add_topic(channel.recorded, channel.type_name)
+        bag.add_topic(interface.SCENE.recorded, interface.SCENE.type_name)
         begin = round((start + EPOCH) * 1e9)
         bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
         for index in range(frames):
@@ -135,13 +123,15 @@ def render_bag(
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)
             velocity = (reference.at(after)[0] - reference.at(before)[0]) / (after - before)
             stamp, (tail, heading, thread) = round((time + EPOCH) * 1e9), reference.at(time)
-            instant = (
-                *messages(stamp, tail, heading, thread),
-                packing.packed_twist(stamp, velocity),
-                packing.packed_pose_stamped(stamp, tail, heading),
-                packing.packed_path(stamp, _resampled(thread, 51)),
+            outputs = (
+                *measure(stamp, tail, heading, thread),
+                (interface.NEEDLE_COMMAND, packing.packed_twist(stamp, velocity)),
+                (interface.GROUND_TRUTH_NEEDLE, packing.packed_pose_stamped(stamp, tail, heading)),
+                (interface.GROUND_TRUTH_THREAD, packing.packed_path(stamp, _resampled(thread, 51))),
             )
-            for channel, message in zip(channels, instant, strict=True):
+            for channel, message in outputs:
+                if index == 0:
+                    bag.add_topic(channel.recorded, channel.type_name)
                 bag.write(channel.recorded, stamp, message)
             progress((index + 1) / frames)
     return frames
@@ -154,28 +144,27 @@ def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
     not draw them.
     """
     metadata, model, obstacles = reference.metadata, setup.model, setup.scene.obstacles
-    attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}.get(str(metadata.get("boundary")))
-    length = metadata.get("material", {}).get("L_m")
-    given, expected = (
-        np.array([(*d.centre, d.radius) for d in discs if isinstance(d, Disc)])
-        for discs in (obstacles, reference.discs)
+    length, attachment = metadata.get("material", {}).get("L_m"), str(metadata.get("boundary"))
+    discs, expected = (
+        np.array([(*d.centre, d.radius) for d in shapes if isinstance(d, Disc)])
+        for shapes in (obstacles, reference.discs)
     )
-    same = len(given) == len(obstacles) == len(expected) and np.allclose(given, expected, rtol=0.0, atol=1e-9)
-    problems: dict[str, tuple[object, object]] = {}
-    if length is not None and not math.isclose(model.thread_length, length, rel_tol=0.0, abs_tol=1e-9):
-        problems["thread_model.thread_length"] = model.thread_length, length
-    if attachment is not None and model.attachment != attachment.value:
-        problems["thread_model.attachment"] = model.attachment, attachment.value
-    if not same:
-        problems["scene"] = obstacles, reference.discs
-    for name, (found, wanted) in problems.items():
-        raise ConfigurationError(name, found, f"{wanted}, as in {reference.name}", str(setup.path))
+    same = len(discs) == len(obstacles) == len(expected) and np.allclose(discs, expected, rtol=0.0, atol=1e-9)
+    is_long = length is not None and not math.isclose(model.thread_length, length, rel_tol=0.0, abs_tol=1e-9)
+    is_fixed = attachment in ("pinned", "clamped") and model.attachment != attachment
+    for is_wrong, name, value, wanted in (
+        (is_long, "thread_model.thread_length", model.thread_length, length),
+        (is_fixed, "thread_model.attachment", model.attachment, attachment),
+        (not same, "scene", obstacles, reference.discs),
+    ):
+        if is_wrong:
+            raise ConfigurationError(name, value, f"{wanted}, as in {reference.name}", str(setup.path))
 
 
-Messages: TypeAlias = "Callable[[int, Points, float, Points], tuple[bytes, bytes]]"  # of stamp, tail, heading, thread
+Measure: TypeAlias = "Callable[[int, Points, float, Points], packing.Outputs]"  # of stamp, tail, heading, thread
 
 
-def _frames(setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> Messages:
+def _frames(setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> Measure:
     """Return what makes a camera frame and its camera_info."""
     view = DishView((322.0, 238.0), setup.scene.dish.diameter / (0.9115 * SIZE[1]))
     scene = CameraScene(
@@ -187,29 +176,28 @@ def _frames(setup: Setup, reference: ReferenceTrajectory, quality: int, seed: in
     )
     camera = DishCamera(scene, view, SIZE, seed)
 
-    def messages(stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
-        data = encode_jpeg(camera.render(tail, heading, thread), quality)
-        information = packing.packed_camera_info(stamp, camera.size, camera.view, 0.3)  # m above the dish
-        return packing.packed_compressed_image(stamp, data), information
+    def measure(stamp: int, tail: Points, heading: float, thread: Points) -> packing.Outputs:
+        jpeg = encode_jpeg(camera.render(tail, heading, thread), quality)
+        return packing.camera_outputs(stamp, jpeg, camera.size, camera.view, 0.3)  # m above the dish
 
-    return messages
+    return measure
 
 
-def _poses(setup: Setup, noise: float, seed: int) -> Messages:
+def _poses(setup: Setup, noise: float, seed: int) -> Measure:
     """Return what makes a pose and a measured thread, as a tracker would measure them in the frames."""
     deviations, random = np.array([noise, noise, noise / setup.vision.needle_length]), np.random.default_rng(seed)
 
-    def messages(stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
+    def measure(stamp: int, tail: Points, heading: float, thread: Points) -> packing.Outputs:
         offset = deviations * random.standard_normal(3)
-        angle = heading + offset[2]
+        angle, tail = heading + offset[2], tail + offset[:2]
         direction = np.array([np.cos(angle), np.sin(angle)])
-        pose = packing.packed_pose(stamp, tail + offset[:2], direction, np.diag(deviations**2))
+        yield from packing.pose_outputs(stamp, tail, direction, np.diag(deviations**2))
         measured = _resampled(thread, 64)
         measured[1:] += noise * random.standard_normal(measured[1:].shape)
-        measured[0] = tail + offset[:2]  # a measured thread begins at the measured tail
-        return pose, packing.packed_path(stamp, measured)
+        measured[0] = tail  # a measured thread begins at the measured tail
+        yield interface.MEASURED_THREAD, packing.packed_path(stamp, measured)
 
-    return messages
+    return measure
 
 
 def _resampled(thread: Points, count: int) -> Points:

@@ -48,13 +48,13 @@ def run_replay(options: argparse.Namespace, terminal: command.Terminal) -> int:
         if options.offline and getattr(options, name):
             raise ConfigurationError(f"--{name}", getattr(options, name), "none with --offline, which knows no time")
     with terminal.progress("replay") as advance:
-        given = {**command.bag_selection(options), "log": terminal.log, "progress": advance}
+        chosen = {**command.bag_selection(options), "log": terminal.log, "progress": advance}
         if options.offline:
-            summary = replay_offline(options.bag, options.output, **given)
+            summary = replay_offline(options.bag, options.output, **chosen)
         else:
             from magnetosuture_thread.commands.live import replay_live  # late, as it needs ROS
 
-            summary = replay_live(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **given)
+            summary = replay_live(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **chosen)
     terminal.print(summary_table(summary))
     terminal.log(f"results: {options.output}")
     return command.DONE

@@ -89,14 +89,13 @@ def run_thread_behavior(options: argparse.Namespace, terminal: Terminal) -> int:
         runs = thread_behavior(options.output, log=terminal.log, progress=advance)
     columns = ("setup", "ground truth", "measured", "frames", "needle off path")
     cells = []
-    for run in runs:
-        summary = run.summary
+    for summary in (run.summary for run in runs):
         errors = [
             f"{figures['mean']:.3f} ({figures['maximum']:.3f})" if figures else "none"
             for figures in (summary.error_truth, summary.error_seen)
         ]
-        frames = f"{summary.predicted} of {summary.frames}"
-        cells.append((summary.setup, *errors, frames, f"{1e3 * summary.path_error:.2f} mm"))
+        frames, off = f"{summary.predicted} of {summary.frames}", f"{1e3 * summary.path_error:.2f} mm"
+        cells.append((summary.setup, *errors, frames, off))
     caption = "errors of the prediction, mean (maximum) over time in % of the thread's length; needle: RMS"
     terminal.print(make_table("thread behavior, closed loop, simulated", columns, cells, caption))
     terminal.log(f"results: {options.output}")
@@ -141,36 +140,32 @@ def thread_behavior(
         ConfigurationError: a setup cannot be used.
         GraphError: a node ended or did not come.
     """
-    chosen = [read_setup(name) for name in setups]
+    chosen, runs = [read_setup(name) for name in setups], []
     with whole_folder(output) as folder:
-        runs = []
         for index, setup in enumerate(chosen):
 
             def advance(share: float, done: int = index) -> None:
                 progress((done + share) / len(chosen))
 
             log(setup.name)
-            simulate(str(setup.path), folder / setup.name, log=log, progress=advance)
-            runs.append(_measured(folder / setup.name, setup))
+            path = folder / setup.name
+            simulate(str(setup.path), path, log=log, progress=advance)
+            bag = Bag(path)
+            collector = measure_loop(bag, setup)
+            summary, instants = collector.summary(setup.name), collector.instants
+            if not instants:
+                raise BagError(path, "holds no predicted thread")
+            # Spread evenly over the run, the last instant among them.
+            at = np.linspace(0, len(instants) - 1, SHOWN + 1).round().astype(int)[1:]
+            stamps = {instants[index].stamp for index in at}
+            records = bag.records({COMPRESSED_IMAGE.recorded})
+            images = {stamp: read_image(record) for record in records if (stamp := stamp_of(record)) in stamps}
+            runs.append(BehaviorRun(setup, summary, instants, images))
         figures = [run.summary.to_json() for run in runs]
         (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         if picture := picture_or_log(partial(draw_behavior, runs), log):
             (folder / "behaviour.png").write_bytes(picture)
     return runs
-
-
-def _measured(path: Path, setup: Setup) -> BehaviorRun:
-    """Return a run's figures, and the images of instants that are spread evenly over it, the last among them."""
-    bag = Bag(path)
-    collector = measure_loop(bag, setup)
-    summary, instants = collector.summary(setup.name), collector.instants
-    if not instants:
-        raise BagError(path, "holds no predicted thread")
-    at = np.linspace(0, len(instants) - 1, SHOWN + 1).round().astype(int)[1:]
-    stamps = {instants[index].stamp for index in at}
-    records = bag.records({COMPRESSED_IMAGE.recorded})
-    images = {stamp: read_image(record) for record in records if (stamp := stamp_of(record)) in stamps}
-    return BehaviorRun(setup, summary, instants, images)
 
 
 def draw_behavior(runs: Sequence[BehaviorRun]) -> bytes:

@@ -76,10 +76,10 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
     new = not options.output.exists()
-    given = command.given(options, "duration", "rate", "boards", "procedure")
+    chosen = command.given(options, "duration", "rate", "boards", "procedure")
     try:
         with terminal.progress("simulate") as advance:
-            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **given)
+            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **chosen)
     except KeyboardInterrupt:
         if new and options.output.exists():
             terminal.log(f"what was recorded is in {options.output}")
@@ -162,8 +162,8 @@ def simulate(
         summary = replace(summary, procedure=task.result, too_slow=slow)
         figures = summary.to_json()
     except GraphError as error:
-        told = "{}: {}, {}; ".format(*outcome_line(task.result)) if task.result else ""
-        raise GraphError(f"{told}{error}") from None
+        words = "{}: {}, {}; ".format(*outcome_line(task.result)) if task.result else ""
+        raise GraphError(f"{words}{error}") from None
     finally:
         if task.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
@@ -289,7 +289,7 @@ class _Run:
         setup, task = self.setup, self.task
         arguments = ["--params-file", str(setup.path.resolve()), *live.OWN, *task.arguments]
         if self.rate is not None:
-            arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self.rate)}"]
+            arguments += live.arguments_of({"use_sim_time": "true", "rig_simulator:rate": float(self.rate)})
         text, what = setup.path.read_text(encoding="utf-8"), f"the whole rig, closed loop, setup {setup.name}"
         notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
         every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *task.recorded)
@@ -297,8 +297,9 @@ class _Run:
         nodes = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
         processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
-            simulated = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
-            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else simulated
+            bridge = {"coil_bridge:driver": "simulated", "coil_bridge:autostart": "armed"}
+            bridge = _wired(ports, len(setup.coils.coil_angles)) if self.boards else bridge
+            arguments += live.arguments_of(bridge)
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
             with live.own_graph(processes, arguments, folder / "logs", nodes, self.log) as graph:
@@ -380,10 +381,10 @@ def _arm() -> None:
                 raise GraphError(f"the bridge cannot be armed: {error}") from None
 
 
-def _wired(folder: str, coils: int) -> list[str]:
-    """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
+def _wired(folder: str, coils: int) -> dict[str, str]:
+    """Return the parameters under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
-    values = {
+    return {
         "coil_bridge:driver": "roboclaw",
         "coil_bridge:autostart": "active",
         "coil_bridge:roboclaw_ports": ports,
@@ -395,7 +396,6 @@ def _wired(folder: str, coils: int) -> list[str]:
         "rig_simulator:power_stage": "roboclaw",
         "rig_simulator:power_stage_ports": ports,
     }
-    return [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
 
 
 def _wait(recorder: clients.Recorder, check: Callable[[], None], log: Log) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import re
 import time
@@ -11,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +111,8 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
             tracker.set_lens(frame.lens)
             began = time.thread_time()
             track = _look(tracker, frame, source.is_sequence)
-            rows.append(_row(frame, track, time.thread_time() - began))
-            if source.unverified:
-                rows[-1]["unverified"] = source.unverified
+            unverified = {"unverified": source.unverified} if source.unverified else {}
+            rows.append({**_row(frame, track, time.thread_time() - began), **unverified})
             if writer is not None and frame.image is not None:
                 drawn = draw_overlay(frame.undistorted(), track, settings.needle_length, frame.name)
                 if track.view is not None:
@@ -231,7 +230,16 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
         raise BagError(path, "is no video and no folder of frames of one size, so --rate has no meaning for it")
     source = FrameSource(is_sequence=is_bag or is_video or is_folder)
     if is_bag:
-        recording, camera = _open_recording(Bag(path, remap=dict(options.remap)), log)
+        bag = Bag(path, remap=dict(options.remap))
+        recording = Recording(bag)
+        doubt = f"is unverified: {bag.salvaged_without_checksum}" if bag.salvaged_without_checksum else ""
+        for line in (str(bag.damage or ""), doubt or bag.has_no_checksum, *recording.remarks):
+            if line:
+                log(f"{recording.path} {line}")
+        camera = recording.camera
+        if camera is None:
+            topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+            raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
         if recording.rectified and lens is not None:
             raise BagError(path, f"has rectified frames on {recording.rectified}; omit --camera-info")
         source.count, source.unverified = recording.counts[camera.recorded], recording.salvaged_without_checksum
@@ -250,19 +258,6 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
             for index, (name, file) in enumerate(zip(source.names, files, strict=True))
         )
     return source
-
-
-def _open_recording(bag: Bag, log: Log) -> tuple[Recording, Channel]:
-    """Return a bag with its camera, and log what is unusual about it."""
-    recording = Recording(bag)
-    doubt = f"is unverified: {bag.salvaged_without_checksum}" if bag.salvaged_without_checksum else bag.has_no_checksum
-    for line in (str(bag.damage or ""), doubt, *recording.remarks):
-        if line:
-            log(f"{recording.path} {line}")
-    if recording.camera is None:
-        topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
-        raise BagError(bag.path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
-    return recording, recording.camera
 
 
 def _filmed(source: FrameSource, path: Path, video: Video, lens: Lens | None) -> Iterator[FrameFile]:
@@ -293,7 +288,7 @@ def _recorded(source: FrameSource, recording: Recording, camera: Channel, overri
 
 def _median_rate(recording: Recording, camera: Channel) -> float:
     """Return the frame rate by the median interval of a bag's first frames' stamps [1/s]."""
-    intervals = 1e-9 * np.diff([stamp_of(record) for record in islice(recording.records([camera]), 300)])
+    intervals = 1e-9 * np.diff([stamp_of(record) for record in itertools.islice(recording.records([camera]), 300)])
     if not np.any(intervals > 0.0):
         return 30.0
     # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
@@ -330,10 +325,10 @@ def _files_at(path: Path) -> list[Path]:
     except (OSError, ValueError) as error:
         raise BagError(path, f"cannot be read: {error}") from None
     endings = (*PICTURES, *STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)
-    found = [file for file in inside if file.name.lower().endswith(endings) and file.is_file()]
-    if not found:
+    files = [file for file in inside if file.name.lower().endswith(endings) and file.is_file()]
+    if not files:
         raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
-    return found
+    return files
 
 
 def numbered(names: Sequence[str], form: str) -> list[str]:
@@ -343,26 +338,24 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
         names: that may come again.
         form: of a name with its number, 2 and up, for example `{}_{}`.
     """
-    taken, given = dict[str, None](), set(names)
+    taken = dict[str, None]()
     for name in names:
-        own, number = name, 1
-        while own in taken or (number > 1 and own in given):
-            number += 1
-            own = form.format(name, number)
-        taken[own] = None
+        others = (form.format(name, number) for number in itertools.count(2))
+        free = name if name not in taken else next(o for o in others if o not in taken and o not in names)
+        taken[free] = None
     return list(taken)
 
 
 def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> Track:
     """Return what a frame shows."""
+    if frame.image is None:
+        return no_pose(State.LOST, frame.problem, None)
     try:
-        if frame.image is None:
-            raise InvalidInputError("image", "a broken picture", frame.problem)
         if in_sequence and frame.stamp is not None:
             return tracker.track(frame.image, frame.stamp)
         return tracker.look(frame.image)
     except InvalidInputError as error:
-        return no_pose(State.LOST, frame.problem or str(error), None)
+        return no_pose(State.LOST, str(error), None)
 
 
 def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
@@ -378,7 +371,7 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
     pose: dict[str, Any] = dict.fromkeys(names)
     if not track.reason:
         angle, pieces = np.arctan2(track.heading[1], track.heading[0]), map(_piece, track.observation.pieces)
-        values = (track.tail, angle, track.tip, np.float64(track.curvature), track.centreline)
+        values = (track.tail, angle, track.tip, track.curvature, track.centreline)
         pose = dict(zip(names, (*map(_finite, values), list(pieces)), strict=True))
     return {
         "file": frame.name,
@@ -390,17 +383,18 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         "metres_per_pixel": None if track.view is None else track.view.metres_per_pixel,
         "scale_doubt": None if track.view is None else track.scale_error,
         **pose,
-        "needle_length_m": None if track.needle_length is None else _finite(np.float64(track.needle_length)),
+        "needle_length_m": _finite(track.needle_length),
         "complete": track.observation.complete,
-        "confidence": _finite(np.float64(track.confidence)),
+        "confidence": _finite(track.confidence),
         "time_s": duration,
         "stamp_s": frame.stamp,
     }
 
 
-def _finite(values: np.ndarray | np.float64) -> Any:
-    """Return a number, or an array as lists; None where any of it is not finite."""
-    return values.tolist() if np.isfinite(values).all() else None
+def _finite(values: Any) -> Any:
+    """Return a number, or an array as lists; None where any of it is not finite, or there is none."""
+    array = np.asarray(np.nan if values is None else values, dtype=float)
+    return array.tolist() if np.isfinite(array).all() else None
 
 
 def _piece(piece: ThreadPiece) -> dict[str, Any]:
@@ -410,7 +404,7 @@ def _piece(piece: ThreadPiece) -> dict[str, Any]:
         "deviation_m": piece.deviation.tolist(),
         "first_end": piece.first_end.name.lower(),
         "last_end": piece.last_end.name.lower(),
-        "arc_length_m": [_finite(np.float64(value)) for value in piece.arc_length],
+        "arc_length_m": [_finite(value) for value in piece.arc_length],
         "direction_known": piece.direction_known,
         "confidence": piece.confidence,
     }

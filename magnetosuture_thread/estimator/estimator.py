@@ -18,7 +18,7 @@ from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceT
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import SOLID, BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction

@@ -10,7 +10,7 @@ from magnetosuture_thread.estimator.association import LENGTH_ERROR
 from magnetosuture_thread.estimator.estimator import Snapshot, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.settings.arguments import checked_arguments
+from magnetosuture_thread.settings.configuration import checked_arguments
 from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedlePose
 

@@ -30,7 +30,7 @@ from magnetosuture_thread.geometry.compiled import TypedKernel
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, as_numbers, chain_inside, finite_array, lay_behind_needle
 from magnetosuture_thread.geometry.scene import WALL_NAME, Scene
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.shapes import MIN_EXTENT, Disc, Obstacle, Polygon, triangulate
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 __all__ = ["Disc", "Obstacle", "Polygon", "triangulate"]

@@ -18,7 +18,7 @@ import shapely
 from magnetosuture_thread.geometry.obstacles import MAX_FRICTION
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.shapes import Disc, Polygon
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 KINDS = ("tissue", "instrument", "wall")

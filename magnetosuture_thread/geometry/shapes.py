@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.validation import explain_validity
 
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 MAX_COORDINATE = 10.0

@@ -34,8 +34,13 @@ from magnetosuture_thread.settings.configuration import (
     parse_parameter_value,
     suggest_names,
 )
-from magnetosuture_thread.settings.parameter_files import EVERY_NODE, key_matches, names_of, read_sections
-from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.settings.shared_parameters import (
+    EVERY_NODE,
+    SHARED_PARAMETERS,
+    key_matches,
+    names_of,
+    read_sections,
+)
 
 C = TypeVar("C", bound=Configuration)
 

@@ -20,8 +20,7 @@ from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.settings.configuration import Configuration, errors_of_file
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import find_file
-from magnetosuture_thread.settings.parameter_files import EVERY_NODE, load_setup
-from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.settings.shared_parameters import EVERY_NODE, SHARED_PARAMETERS, load_setup
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 

@@ -1,7 +1,8 @@
 """Configuration classes: frozen dataclasses with default, unit, bounds and one sentence for each field.
 
 Validation of YAML files, the parameters that a node declares, and their descriptions are derived from the class.
-Values are checked when the object is created, so every object is valid.
+Values are checked when the object is created, so every object is valid. Arguments of public functions and dataclasses
+are checked by the same quantities, in their annotations; see `checked_arguments`.
 
 The standard library's dataclasses carry this. attrs has nothing more that would be used here; msgspec checks what it
 decodes, not what is constructed; pydantic 2 adds 0.1 s to the start of every node, and Ubuntu 24.04 has pydantic 1.10.
@@ -11,15 +12,17 @@ None of them refuses a number by its unit, so the check itself is ours with each
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, ClassVar, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -27,9 +30,8 @@ from magnetosuture_thread.settings.errors import MAX_NAME_CHARS, ConfigurationEr
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml, read_regular
 
 C = TypeVar("C", bound="Configuration")
+T = TypeVar("T")
 
-
-MAX_SUGGESTIONS = 20  # names in an error, which is one line
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
 
@@ -181,6 +183,88 @@ configuration_fields = cast("Callable[[type[Configuration]], tuple[Configuration
 """Return the fields of a configuration class."""
 
 
+WORDS: dict[type, str] = {bool: "true or false", NoneType: "nothing"}
+
+
+def bounded(*arguments: Any, **options: Any) -> Quantity:
+    """Return a quantity without a description, to annotate an argument's type, as in `Annotated[float, LENGTH]`."""
+    return Quantity("", *arguments, **options)
+
+
+def checked_arguments(owner: str, kind: Callable[..., Exception] = ConfigurationError) -> Callable[[T], T]:
+    """Make a function, or a dataclass, refuse arguments that are not as annotated: of another type, or out of bounds.
+
+    A number has to be finite and within its quantity, see `within`; it may be one of numpy, and a list an array. They
+    arrive as numbers of Python and tuples of them. None is accepted where it is the default.
+
+    Args:
+        owner: what the arguments are of, for errors.
+        kind: of the errors, made from name, value and expectation.
+    """
+
+    def decorate(target: Any) -> Any:
+        function = vars(target)["__init__"] if isinstance(target, type) else target
+        signature = inspect.signature(function)
+
+        @cache
+        def checkers() -> dict[str, Callable[[str, Any], Any]]:  # at the first call, when all names are known
+            hints = get_type_hints(target, include_extras=True).items()
+            return {name: check for name, hint in hints if (check := _checker(hint)) is not None}
+
+        @wraps(function)
+        def checked(*args: Any, **kwargs: Any) -> Any:
+            bound = signature.bind(*args, **kwargs)
+            try:
+                for name, value in bound.arguments.items():
+                    check = checkers().get(name)
+                    if check is not None and (value is not None or signature.parameters[name].default is not None):
+                        bound.arguments[name] = check(f"{owner}.{name}", value)
+            except ConfigurationError as error:
+                raise kind(error.name, error.value, error.expectation) from None
+            return function(*bound.args, **bound.kwargs)
+
+        if function is target:
+            return checked
+        target.__init__ = checked
+        return target
+
+    return decorate
+
+
+@cache
+def _checker(hint: Any) -> Callable[[str, Any], Any] | None:
+    """Return what checks an argument of an annotation; None for one that is neither class nor number, as an array."""
+    hint, quantity = get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, Quantity(""))
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    lists = [kind for kind in kinds if {int, float} & {*get_args(kind)}]
+    if lists or {int, float} & {*kinds}:
+        kind, entry = int if int in kinds else float, get_args(lists[0])[0] if lists else float
+        may_be_number = not lists or len(kinds) > 1
+
+        def check_number(name: str, value: Any) -> Any:
+            value = value.tolist() if hasattr(value, "tolist") else value
+            if lists and not (may_be_number and isinstance(value, (int, float))):
+                return quantity.checked(name, value, tuple, entry)
+            return quantity.checked(name, value, kind)
+
+        return check_number
+    classes = tuple(Sequence if get_origin(kind) is tuple else get_origin(kind) or kind for kind in kinds)
+    if not all(isinstance(kind, type) and not hasattr(kind, "__array__") for kind in classes):
+        return None
+    entries = get_args(kinds[0])
+
+    def check_class(name: str, value: Any) -> Any:
+        if not isinstance(value, classes) or (isinstance(value, str) and str not in classes):
+            words = [WORDS.get(kind, f"an instance of {kind.__name__}") for kind in classes]
+            raise ConfigurationError(name, value, " or ".join(words))
+        if entries and isinstance(value, (list, tuple)) and (check := _checker(entries[0])) is not None:
+            for index, item in enumerate(value):
+                check(f"{name}[{index}]", item)
+        return value
+
+    return check_class
+
+
 @contextmanager
 def errors_of_file(source: str) -> Iterator[None]:
     """Name a file in every `ConfigurationError` that names none yet."""
@@ -297,8 +381,7 @@ def parse_parameter_value(text: str) -> Any:
 def suggest_names(name: str, known: Sequence[str]) -> str:
     """Return known names as text, the most similar ones of many, with the closest match as a hint."""
     name = name[:MAX_NAME_CHARS]  # to compare long texts takes long
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
-    similar = difflib.get_close_matches(name, known, n=MAX_SUGGESTIONS, cutoff=0.0)
-    shown = known if len(known) <= MAX_SUGGESTIONS else [*similar, "…"]
+    similar = difflib.get_close_matches(name, known, n=20, cutoff=0.0)
+    hint = f" (did you mean {similar[0]}?)" if difflib.get_close_matches(name, similar[:1]) else ""
+    shown = known if len(known) <= 20 else [*similar, "…"]  # in one line
     return f"one of {', '.join(shown)}{hint}"

@@ -55,8 +55,8 @@ def missing_module(error: ModuleNotFoundError) -> str:
         return f"{error}; nodes and the live graph need ROS 2 Jazzy: {sourced}; without ROS: pip install '.[ros]'"
     name = _DISTRIBUTIONS.get(module, module)
     with suppress(PackageNotFoundError):
-        found = [each.split(";")[0].strip() for each in requires("magnetosuture_thread") or ()]
-        name = next((each for each in found if re.split("[^A-Za-z0-9_.-]", each)[0].lower() == name.lower()), name)
+        needs = [line.split(";")[0].strip() for line in requires("magnetosuture_thread") or ()]
+        name = next((need for need in needs if re.split("[^A-Za-z0-9_.-]", need)[0].lower() == name.lower()), name)
     return f"{error}; a Python package is missing: pip install '{name}'; see docs/how_to/installation.md"
 
 
@@ -79,14 +79,10 @@ class ConfigurationError(MagnetosutureError):
     """
 
     def __init__(self, name: str, value: object, expectation: str, source: str = "") -> None:
-        self.name = name
-        self.value = value
-        self.expectation = expectation
-        self.source = source
+        self.name, self.value, self.expectation, self.source = name, value, expectation, source
         where = f"{shortened(source, MAX_NAME_CHARS)}: " if source else ""
-        super().__init__(
-            f"{where}{shortened(name, MAX_NAME_CHARS)}: got {shortened(repr(value))}, expected {expectation}"
-        )
+        what = shortened(name, MAX_NAME_CHARS)
+        super().__init__(f"{where}{what}: got {shortened(repr(value))}, expected {expectation}")
 
 
 class BagError(MagnetosutureError):
@@ -98,8 +94,7 @@ class BagError(MagnetosutureError):
     """
 
     def __init__(self, path: object, problem: str) -> None:
-        self.path = str(path)
-        self.problem = problem
+        self.path, self.problem = str(path), problem
         super().__init__(f"{path}: {problem}")
 
 
@@ -127,9 +122,7 @@ class InvalidInputError(MagnetosutureError):
     """
 
     def __init__(self, field: str, value: object, expectation: str) -> None:
-        self.field = field
-        self.value = value
-        self.expectation = expectation
+        self.field, self.value, self.expectation = field, value, expectation
         super().__init__(f"{shortened(field, MAX_NAME_CHARS)}: got {shortened(str(value))}, expected {expectation}")
 
 
@@ -144,13 +137,9 @@ class SolverError(MagnetosutureError):
     """
 
     def __init__(self, solver: str, status: str, residual: float, tolerance: float) -> None:
-        self.solver = solver
-        self.status = status
-        self.residual = residual
-        self.tolerance = tolerance
-        super().__init__(
-            f"{solver} ended with status {status!r} and residual {residual:.1e}, expected at most {tolerance:.1e}"
-        )
+        self.solver, self.status, self.residual, self.tolerance = solver, status, residual, tolerance
+        words = f"{solver} ended with status {status!r} and residual {residual:.1e}"
+        super().__init__(f"{words}, expected at most {tolerance:.1e}")
 
 
 class GraphError(MagnetosutureError):
@@ -166,6 +155,5 @@ class DriverError(MagnetosutureError):
     """
 
     def __init__(self, driver: str, problem: str) -> None:
-        self.driver = driver
-        self.problem = problem
+        self.driver, self.problem = driver, problem
         super().__init__(f"driver {driver}: {problem}")

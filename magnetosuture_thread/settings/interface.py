@@ -5,6 +5,8 @@ Nothing of ROS is needed here: bags are read and written by the same names on ma
 Names follow the Collaborative Robotics Toolkit (CRTK) where it has one: `measured_cp` is a measured
 Cartesian position, `servo_cv` a velocity to follow now, `setpoint_cv` the velocity that is really asked
 of the actuators. Of their types that of `needle/measured_cp` is not CRTK's: it has a covariance.
+
+Comments that begin with `#:` say what a topic's messages are, and what a service does, for the reference.
 """
 
 from __future__ import annotations
@@ -49,14 +51,12 @@ class Channel:
     Attributes:
         name: without a leading slash, so that a namespace can come before it.
         type_name: for example `nav_msgs/msg/Path`.
-        about: what its messages are, for the reference.
         quality: of service.
         absolute: whether no namespace comes before it.
     """
 
     name: str
     type_name: str
-    about: str
     quality: Quality = Quality.RELIABLE
     absolute: bool = False
 
@@ -66,168 +66,123 @@ class Channel:
         return f"/{self.name}"
 
 
-IMAGE = Channel(
-    "camera/image_raw", "sensor_msgs/msg/Image", "camera frames, instead of compressed ones", Quality.FRAMES
-)
-COMPRESSED_IMAGE = Channel(
-    "camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "camera frames", Quality.FRAMES
-)
-CAMERA_INFO = Channel(
-    "camera/camera_info", "sensor_msgs/msg/CameraInfo", "the lens, whose distortion is undone", Quality.SENSOR
-)
-NEEDLE_POSE = Channel(
-    "needle/measured_cp",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "the needle's tail, x axis along the needle; a heading with a deviation above 1 rad is unknown: the axis alone is",
-    Quality.SENSOR,
-)
-NEEDLE_TIP = Channel(
-    "needle/tip",
-    "geometry_msgs/msg/PointStamped",
-    "a point near the needle's tip, by a person, for a needle of which nothing else tells the direction",
-)
-TRACKER_STATE = Channel(
-    "needle/tracker_state",
-    "magnetosuture_msgs/msg/TrackerState",
-    "searching, tracked or lost, why, confidence, curvature; where the dish is in the image",
-)
-TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped", "where the path wants the tip")
-OPERATOR_COMMAND = Channel(
-    "operator/servo_cv",
-    "geometry_msgs/msg/TwistStamped",
-    "velocity of the tip commanded by an operator's page or joystick; has priority, pauses a procedure",
-)
-FILTER_STATE = Channel(
-    "needle/filter_state",
-    "magnetosuture_msgs/msg/FilterState",
-    "commanded, filtered and applied velocity, active constraints, why the needle rests",
-)
-NEEDLE_COMMAND = Channel(
-    "needle/servo_cv",
-    "geometry_msgs/msg/TwistStamped",
-    "velocity of the tip, followed while no operator commands; of one node at a time",
-)
-NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped", "velocity that the currents give")
-MEASURED_THREAD = Channel(
-    "thread/measured",
-    "nav_msgs/msg/Path",
-    "the measured centreline from the tail on, for viewers, and where there is no thread/observation",
-)
-THREAD_OBSERVATION = Channel(
-    "thread/observation",
-    "magnetosuture_msgs/msg/ThreadObservation",
-    "the pieces of the thread that a frame shows, whether they are all of it, and what may hide the rest",
-)
-PREDICTED_THREAD = Channel(
-    "thread/predicted", "magnetosuture_msgs/msg/PredictedThread", "the thread by the model alone"
-)
-ESTIMATED_THREAD = Channel(
-    "thread/estimated",
-    "magnetosuture_msgs/msg/EstimatedThread",
-    "the thread by model and camera, with covariances and unknown forces; again where an observation is late",
-)
-FORECAST = Channel(
-    "thread/forecast",
-    "magnetosuture_msgs/msg/ThreadForecast",
-    "where needle and thread will be by the plan or the command held, where forecast_horizon is above 0",
-)
-MARGINS = Channel(
-    "thread/margins",
-    "magnetosuture_msgs/msg/SafetyMargins",
-    "every barrier, its minimum and 99 % bound, contact, friction; of the estimated thread if there is one",
-)
-THREAD_MARKERS = Channel(
-    "thread/markers", "visualization_msgs/msg/MarkerArray", "thread, margins and forecast, for RViz and Foxglove"
-)
-SCENE = Channel(
-    "scene", "magnetosuture_msgs/msg/Scene", "the dish and the named shapes in it, from now on", Quality.LATCHED
-)
-SCENE_MARKERS = Channel(
-    "scene/markers", "visualization_msgs/msg/MarkerArray", "the scene, for RViz and Foxglove", Quality.LATCHED
-)
-MATERIAL = Channel(
-    "thread/material",
-    "magnetosuture_msgs/msg/ThreadMaterial",
-    "material, liquid and attachment of the thread from now on; by you, or a calibration",
-    Quality.LATCHED,
-)
-CURRENTS = Channel(
-    "coils/currents", "magnetosuture_msgs/msg/CoilCurrents", "currents commanded to the driver, why they are zero"
-)
-BRIDGE_STATE = Channel(
-    "coils/state", "magnetosuture_msgs/msg/CoilBridgeState", "state, armed, reasons, driver", Quality.LATCHED
-)
-PROCEDURE_STATE = Channel(
-    "procedure/state",
-    "magnetosuture_msgs/msg/ProcedureState",
-    "state, goals met, progress, why it is paused or has failed",
-    Quality.LATCHED,
-)
-PROCEDURE_PLAN = Channel(
-    "procedure/plan", "nav_msgs/msg/Path", "poses of the needle's chord, at its middle, as planned", Quality.LATCHED
-)
-PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header", "a person holds the page's button", Quality.NEWEST)
-DIAGNOSTICS = Channel(
-    "diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "what every node reports of itself", absolute=True
-)
-RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents", "the wires to the simulated coils")
-FAULT_REQUEST = Channel("rig/fault", "std_msgs/msg/String", "kind and duration of a fault, from now on; by you")
-CLOCK = Channel("clock", "rosgraph_msgs/msg/Clock", "simulated time, of rig or replay", Quality.SENSOR, absolute=True)
+#: camera frames, instead of compressed ones
+IMAGE = Channel("camera/image_raw", "sensor_msgs/msg/Image", Quality.FRAMES)
+#: camera frames
+COMPRESSED_IMAGE = Channel("camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", Quality.FRAMES)
+#: the lens, whose distortion is undone
+CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo", Quality.SENSOR)
+#: the needle's tail, x axis along the needle; a heading with a deviation above 1 rad is unknown: the axis alone is
+NEEDLE_POSE = Channel("needle/measured_cp", "geometry_msgs/msg/PoseWithCovarianceStamped", Quality.SENSOR)
+#: a point near the needle's tip, by a person, for a needle of which nothing else tells the direction
+NEEDLE_TIP = Channel("needle/tip", "geometry_msgs/msg/PointStamped")
+#: searching, tracked or lost, why, confidence, curvature; where the dish is in the image
+TRACKER_STATE = Channel("needle/tracker_state", "magnetosuture_msgs/msg/TrackerState")
+#: where the path wants the tip
+TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped")
+#: velocity of the tip commanded by an operator's page or joystick; has priority, pauses a procedure
+OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped")
+#: commanded, filtered and applied velocity, active constraints, why the needle rests
+FILTER_STATE = Channel("needle/filter_state", "magnetosuture_msgs/msg/FilterState")
+#: velocity of the tip, followed while no operator commands; of one node at a time
+NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
+#: velocity that the currents give
+NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")
+#: the measured centreline from the tail on, for viewers, and where there is no thread/observation
+MEASURED_THREAD = Channel("thread/measured", "nav_msgs/msg/Path")
+#: the pieces of the thread that a frame shows, whether they are all of it, and what may hide the rest
+THREAD_OBSERVATION = Channel("thread/observation", "magnetosuture_msgs/msg/ThreadObservation")
+#: the thread by the model alone
+PREDICTED_THREAD = Channel("thread/predicted", "magnetosuture_msgs/msg/PredictedThread")
+#: the thread by model and camera, with covariances and unknown forces; again where an observation is late
+ESTIMATED_THREAD = Channel("thread/estimated", "magnetosuture_msgs/msg/EstimatedThread")
+#: where needle and thread will be by the plan or the command held, where forecast_horizon is above 0
+FORECAST = Channel("thread/forecast", "magnetosuture_msgs/msg/ThreadForecast")
+#: every barrier, its minimum and 99 % bound, contact, friction; of the estimated thread if there is one
+MARGINS = Channel("thread/margins", "magnetosuture_msgs/msg/SafetyMargins")
+#: thread, margins and forecast, for RViz and Foxglove
+THREAD_MARKERS = Channel("thread/markers", "visualization_msgs/msg/MarkerArray")
+#: the dish and the named shapes in it, from now on
+SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene", Quality.LATCHED)
+#: the scene, for RViz and Foxglove
+SCENE_MARKERS = Channel("scene/markers", "visualization_msgs/msg/MarkerArray", Quality.LATCHED)
+#: material, liquid and attachment of the thread from now on; by you, or a calibration
+MATERIAL = Channel("thread/material", "magnetosuture_msgs/msg/ThreadMaterial", Quality.LATCHED)
+#: currents commanded to the driver, why they are zero
+CURRENTS = Channel("coils/currents", "magnetosuture_msgs/msg/CoilCurrents")
+#: state, armed, reasons, driver
+BRIDGE_STATE = Channel("coils/state", "magnetosuture_msgs/msg/CoilBridgeState", Quality.LATCHED)
+#: state, goals met, progress, why it is paused or has failed
+PROCEDURE_STATE = Channel("procedure/state", "magnetosuture_msgs/msg/ProcedureState", Quality.LATCHED)
+#: poses of the needle's chord, at its middle, as planned
+PROCEDURE_PLAN = Channel("procedure/plan", "nav_msgs/msg/Path", Quality.LATCHED)
+#: a person holds the page's button
+PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header", Quality.NEWEST)
+#: what every node reports of itself
+DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", absolute=True)
+#: the wires to the simulated coils
+RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents")
+#: kind and duration of a fault, from now on; by you
+FAULT_REQUEST = Channel("rig/fault", "std_msgs/msg/String")
+#: simulated time, of rig or replay
+CLOCK = Channel("clock", "rosgraph_msgs/msg/Clock", Quality.SENSOR, absolute=True)
 
 # What only a simulation knows; never an input of the graph.
-GROUND_TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped", "the simulated needle")
-GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path", "the simulated thread")
-GROUND_TRUTH_PULL = Channel(
-    "ground_truth/thread_pull",
-    "geometry_msgs/msg/WrenchStamped",
-    "what the simulated thread exerts on the needle at its tail, in the frame of the dish",
-)
+#: the simulated needle
+GROUND_TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped")
+#: the simulated thread
+GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
+#: what the simulated thread exerts on the needle at its tail, in the frame of the dish
+GROUND_TRUTH_PULL = Channel("ground_truth/thread_pull", "geometry_msgs/msg/WrenchStamped")
 
 EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs
 
 
 class Service(str, Enum):
-    """Services: the name of each, its type, the node that offers it, and what it does."""
+    """Services: the name of each, its type, and the node that offers it."""
 
     type_name: str
     node: str
-    about: str
 
     __str__ = str.__str__
 
-    def __new__(cls, name: str, type_name: str, node: str, about: str) -> Service:
+    def __new__(cls, name: str, type_name: str, node: str) -> Service:
         """Return a service, which is its name as a text."""
-        made = str.__new__(cls, name)
-        made._value_, made.type_name, made.node, made.about = name, type_name, node, about
-        return made
+        service = str.__new__(cls, name)
+        service._value_, service.type_name, service.node = name, type_name, node
+        return service
 
-    ARM = "coils/arm", "std_srvs/srv/SetBool", "coil_bridge", "arm, or disarm"
-    EMERGENCY_STOP = "coils/emergency_stop", "std_srvs/srv/Trigger", "coil_bridge", "zero currents at once, latched"
-    RESET = "coils/reset", "std_srvs/srv/Trigger", "coil_bridge", "clear a stop or a fault; it stays disarmed"
-    LOAD_SCENE = "scene/load", "magnetosuture_msgs/srv/LoadScene", SCENE_SERVER, "take another scene"
-    ADD_SHAPE = "scene/add", "magnetosuture_msgs/srv/EditShape", SCENE_SERVER, "add a shape to the scene"
-    REPLACE_SHAPE = "scene/replace", "magnetosuture_msgs/srv/EditShape", SCENE_SERVER, "replace the shape of a name"
-    REMOVE_SHAPE = "scene/remove", "magnetosuture_msgs/srv/RemoveShape", SCENE_SERVER, "remove a shape"
-    FORECAST_PATH = (
-        "thread/forecast_path",
-        "magnetosuture_msgs/srv/ForecastPath",
-        "thread_model",
-        "forecast of a path of the tip, where forecast_horizon is above 0; nothing moves",
-    )
-    PLAN_PROCEDURE = (
-        "procedure/make_plan",
-        "magnetosuture_msgs/srv/PlanProcedure",
-        PLANNER,
-        "check a procedure, plan it",
-    )
-    PAUSE_PROCEDURE = "procedure/pause", "std_srvs/srv/Trigger", PLANNER, "pause the procedure"
-    RESUME_PROCEDURE = "procedure/resume", "std_srvs/srv/Trigger", PLANNER, "begin what is planned, or go on"
-    ABORT_PROCEDURE = "procedure/abort", "std_srvs/srv/Trigger", PLANNER, "give the procedure up"
-    PAUSE_REPLAY = "replay/pause", "std_srvs/srv/SetBool", "replay", "let the time of a replayed bag stand still"
-    PAUSE_RIG = "rig/pause", "std_srvs/srv/SetBool", "rig_simulator", "let the rig's time stand still"
+    #: arm, or disarm
+    ARM = "coils/arm", "std_srvs/srv/SetBool", "coil_bridge"
+    #: zero currents at once, latched
+    EMERGENCY_STOP = "coils/emergency_stop", "std_srvs/srv/Trigger", "coil_bridge"
+    #: clear a stop or a fault; it stays disarmed
+    RESET = "coils/reset", "std_srvs/srv/Trigger", "coil_bridge"
+    #: take another scene
+    LOAD_SCENE = "scene/load", "magnetosuture_msgs/srv/LoadScene", SCENE_SERVER
+    #: add a shape to the scene
+    ADD_SHAPE = "scene/add", "magnetosuture_msgs/srv/EditShape", SCENE_SERVER
+    #: replace the shape of a name
+    REPLACE_SHAPE = "scene/replace", "magnetosuture_msgs/srv/EditShape", SCENE_SERVER
+    #: remove a shape
+    REMOVE_SHAPE = "scene/remove", "magnetosuture_msgs/srv/RemoveShape", SCENE_SERVER
+    #: forecast of a path of the tip, where forecast_horizon is above 0; nothing moves
+    FORECAST_PATH = "thread/forecast_path", "magnetosuture_msgs/srv/ForecastPath", "thread_model"
+    #: check a procedure, plan it
+    PLAN_PROCEDURE = "procedure/make_plan", "magnetosuture_msgs/srv/PlanProcedure", PLANNER
+    #: pause the procedure
+    PAUSE_PROCEDURE = "procedure/pause", "std_srvs/srv/Trigger", PLANNER
+    #: begin what is planned, or go on
+    RESUME_PROCEDURE = "procedure/resume", "std_srvs/srv/Trigger", PLANNER
+    #: give the procedure up
+    ABORT_PROCEDURE = "procedure/abort", "std_srvs/srv/Trigger", PLANNER
+    #: let the time of a replayed bag stand still
+    PAUSE_REPLAY = "replay/pause", "std_srvs/srv/SetBool", "replay"
+    #: let the rig's time stand still
+    PAUSE_RIG = "rig/pause", "std_srvs/srv/SetBool", "rig_simulator"
 
 
-SERVICES = {each.value: each for each in Service}  # by name
+SERVICES = {service.value: service for service in Service}  # by name
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 

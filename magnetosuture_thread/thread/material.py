@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
 
 LENGTH = bounded("m", 1e-4, 2.0)

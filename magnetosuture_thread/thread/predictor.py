@@ -14,8 +14,7 @@ from magnetosuture_thread.geometry.barrier import Barrier, check_barriers
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside, finite_array
 from magnetosuture_thread.geometry.scene import Scene, find_collision
-from magnetosuture_thread.settings.arguments import bounded, checked_arguments
-from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.configuration import Quantity, bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins

@@ -14,7 +14,7 @@ import yaml
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.parameter_files import EVERY_NODE
+from magnetosuture_thread.settings.shared_parameters import EVERY_NODE
 from magnetosuture_thread.vision.arc import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.dish import NO_DISH, RING_ERROR, see_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel, shrunk

@@ -16,14 +16,7 @@ from magnetosuture_thread.calibration.parameters import (
     stiffness_over_drag,
 )
 from magnetosuture_thread.calibration.recorded_run import read_run
-from magnetosuture_thread.calibration.result import (
-    FIXED,
-    IDENTIFIED,
-    STAND_IN,
-    CalibrationResult,
-    Estimate,
-    to_yaml,
-)
+from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, STAND_IN, CalibrationResult, Estimate, to_yaml
 from magnetosuture_thread.calibration.search import FitSolution, assess_identifiability, calibrate
 from test.calibration.runs import SETTINGS, SILK, model_run, noisy, rig_passage, rig_run, stiff
 

@@ -52,8 +52,7 @@ def test_a_pulled_thread_follows_exactly(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"boundary": "loose"}, {"material": {}}, {"material": {**MATERIAL, "EA_N": 0.0}}, {"material": None}],
+    "changes", [{"boundary": "loose"}, {"material": {}}, {"material": {**MATERIAL, "EA_N": 0.0}}, {"material": None}]
 )
 def test_metadata_without_a_thread_are_refused(tmp_path: Path, changes: dict):
     with pytest.raises(BagError, match=r"a\.npz: has"):

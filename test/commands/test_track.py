@@ -17,10 +17,9 @@ from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.evaluation.recorded import read_image
 from magnetosuture_thread.settings.interface import COMPRESSED_IMAGE
-from test.bags.bags import copy_with_notes, make, stamped
+from test.bags.bags import copy_with_notes
 from test.vision.scenes import rod
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
@@ -160,17 +159,6 @@ def test_a_video_is_followed_over_time_and_one_that_is_cut_off_is_reported(
     film.write_bytes(film.read_bytes()[: film.stat().st_size * 2 // 3])
     assert cli.main(["track", str(film)]) == 0
     assert "film.avi is damaged" in capsys.readouterr().out.replace("\n", "")
-
-
-def test_an_encoding_that_cannot_be_read_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with BagWriter(tmp_path / "bag") as writer:
-        writer.add_topic("/camera/image_raw", "sensor_msgs/msg/Image")
-        data = {"encoding": "32FC1", "data": np.zeros(48, np.uint8)}
-        message = make("sensor_msgs/msg/Image", stamped(1, "camera"), 3, 4, step=16, **data)
-        writer.write_message("/camera/image_raw", 10**9, message)
-    assert cli.main(["track", str(tmp_path / "bag")]) == 1
-    captured = capsys.readouterr()
-    assert "'32FC1'" in captured.out + captured.err
 
 
 def test_paths_without_frames_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

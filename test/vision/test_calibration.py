@@ -12,7 +12,7 @@ import pytest
 from benchmarks.vision.frames import tilted
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.settings.parameter_files import load_setup
+from magnetosuture_thread.settings.shared_parameters import load_setup
 from magnetosuture_thread.vision.calibration import (
     CORNERS,
     calibrate_by_dish,

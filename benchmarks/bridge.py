@@ -13,18 +13,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
-from rich.console import Console
-from rich.table import Table
 
+from benchmarks.report import figures_table
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
-from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
+from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.power import PowerStage
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import GraphError
@@ -34,32 +33,21 @@ if TYPE_CHECKING:
     from magnetosuture_thread.nodes.processes import NodeProcesses
 
 SETUP = "petri_35mm_polyamide"
-BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
-MOVING = 0.3  # s for which the coils must be driven before something is killed
 START_TIMEOUT = 120.0  # s for a bridge to start and to be heard, on a busy machine
 REARM_AFTER = 10.0  # s without current, after which the bridge is armed again
 TIMEOUT = 60.0  # s for anything to happen
-PARTS = ("commander", "tracker", "coil_bridge")
-FULL = 32767  # duty of the full supply
-KILL_BOUND = 0.25  # s; driver_timeout, and the boards' own clock
 SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
-def zero_delays(event: str, delays: Sequence[float], bound: float) -> dict[str, Any]:
-    """Return the times from an event to zero duty on all boards: median, p99 and greatest [s].
-
-    Args:
-        event: what happened.
-        delays: of each time that the coils were driven then [s]; at least one.
-        bound: what they should not exceed [s]; `beyond` counts those that do.
-    """
-    median, p99, greatest = np.percentile(delays, [50.0, 99.0, 100.0]).tolist()
-    beyond = int(np.sum(np.asarray(delays) > bound))
-    figures = {"event": event, "count": len(delays), "median": median, "p99": p99, "greatest": greatest}
-    return {**figures, "bound": bound, "beyond": beyond}
+def _spread(event: str, delays: Sequence[float], bound: float) -> dict[str, Any]:
+    """Return the times from an event to zero duty on all boards [ms]; `beyond` counts those beyond the bound."""
+    times = 1e3 * np.array(delays)
+    median, p99, greatest = np.percentile(times, [50.0, 99.0, 100.0]).tolist()
+    figures = {"event": event, "count": len(times), "median": median, "p99": p99, "greatest": greatest}
+    return {**figures, "bound": 1e3 * bound, "beyond": int(np.sum(times > 1e3 * bound))}
 
 
 class DriveWatch:
@@ -82,13 +70,8 @@ class DriveWatch:
         self.turns: list[tuple[float, bool]] = []
         self.largest = 0
 
-    @property
     def driven(self) -> bool:
-        """Whether any coil was driven when we last looked."""
-        return bool(self.turns) and self.turns[-1][1]
-
-    def look(self) -> None:
-        """Take what has happened since we last looked."""
+        """Take what has happened since the last look, and return whether any coil is driven."""
         changes = []
         for line in self._stage.lines:
             line.advance()
@@ -100,8 +83,9 @@ class DriveWatch:
         for at, index, duties in sorted(changes):
             self.largest = max(self.largest, *(abs(duty) for duty in duties))
             self._on[index] = any(duties)
-            if any(self._on) != self.driven:
+            if any(self._on) != (bool(self.turns) and self.turns[-1][1]):
                 self.turns.append((at, any(self._on)))
+        return bool(self.turns) and self.turns[-1][1]
 
     def to_zero(self, times: Sequence[float]) -> list[float]:
         """Return, for each time that found the coils driven, how long it took until they were not [s].
@@ -141,22 +125,22 @@ class BridgeBench:
             self._nodes.start(name)
             self.arm()
             return
-        given = [f"kind:={name}", *(f"{key}:={value}" for key, value in parameters.items())]
-        arguments = ["-r", f"__node:={name}", *(part for each in given for part in ("-p", each))]
-        self._nodes.start(name, module="benchmarks.bridge.traffic", arguments=arguments)
+        values = {"kind": name, **parameters}
+        arguments = ["-r", f"__node:={name}", *(part for key in values for part in ("-p", f"{key}:={values[key]}"))]
+        self._nodes.start(name, module="benchmarks.traffic", arguments=arguments)
 
     def stop_trials(self, trials: int) -> list[float]:
         """Let a commander fall silent again and again; return the times from its last command to zero [s]."""
         self.start("commander")
         self.drive()
         self._nodes.kill("commander")
-        self.wait(lambda: not self._driven(), "zero")
-        self.start("commander", burst=BURST, pause=PAUSE)
+        self.wait(lambda: not self.watch.driven(), "zero")
+        self.start("commander", burst=0.2, pause=0.3)  # s of commands, and of silence on average
         log, delays, last = self._logs / "commander.log", list[float](), time.monotonic()
         while len(delays) < trials:
             time.sleep(0.2)
             stops = [float(line) for line in log.read_text().split("\n")[:-1]]  # the last line may be half written
-            if self._driven():
+            if self.watch.driven():
                 last = time.monotonic()
             elif time.monotonic() - last > REARM_AFTER:
                 self.arm()  # a machine that stands still for longer than a board's answer may take is a fault
@@ -174,7 +158,7 @@ class BridgeBench:
             self.drive()
             began = time.monotonic()
             self._nodes.kill(name)
-            self.wait(lambda: not self._driven(), f"zero after {name} was killed")
+            self.wait(lambda: not self.watch.driven(), f"zero after {name} was killed")
             delays += self.watch.to_zero([began])
             self._progress((done + 1) / times)
             self.start(name)
@@ -192,15 +176,15 @@ class BridgeBench:
         for name in ("commander", "tracker"):
             self._nodes.kill(name)
         # While the bridge still counts those that were killed as speaking, it would refuse all without looking.
-        self.wait(lambda: not self._driven(), "zero")
+        self.wait(lambda: not self.watch.driven(), "zero")
         time.sleep(2.0 * SILENCE_TIMEOUT)
-        self.watch.look()
+        self.watch.driven()
         self.watch.largest = 0
         self.start("fuzzer", count=count)
         self.wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", TIMEOUT + count / 200.0)
         self._nodes.kill("fuzzer")  # whose work is done
-        self.watch.look()
-        greatest = self.watch.largest / FULL * SUPPLY / RESISTANCE
+        self.watch.driven()
+        greatest = self.watch.largest / 32767 * SUPPLY / RESISTANCE  # the duty of the full supply
         self.arm()
         self.start("tracker")
         self.start("commander")
@@ -208,10 +192,9 @@ class BridgeBench:
         return greatest
 
     def drive(self) -> None:
-        """Wait until the coils have been driven for a while."""
-        self.wait(
-            lambda: self._driven() and time.monotonic() - self.watch.turns[-1][0] > MOVING, "the coils to be driven"
-        )
+        """Wait until the coils have been driven for 0.3 s."""
+        driven = self.watch.driven
+        self.wait(lambda: driven() and time.monotonic() - self.watch.turns[-1][0] > 0.3, "the coils to be driven")
 
     def arm(self) -> None:
         """Arm the bridge, which may just start."""
@@ -240,20 +223,8 @@ class BridgeBench:
                 with self._client() as client:
                     raise GraphError(f"waited in vain for {what}; the bridge says: {client.state()}")
 
-    def _driven(self) -> bool:
-        self.watch.look()
-        return self.watch.driven
 
-
-def measure_bridge(
-    trials: int,
-    kills: int,
-    hostile: int,
-    *,
-    busy: bool = True,
-    log: Log = print,
-    progress: Progress = lambda share: None,
-) -> dict[str, Any]:
+def measure_bridge(trials: int, kills: int, hostile: int, log: Log, progress: Progress) -> dict[str, Any]:
     """Measure a coil bridge that drives simulated RoboClaw boards, on a machine all of whose cores are busy.
 
     Args:
@@ -262,10 +233,9 @@ def measure_bridge(
         hostile: messages.
         log: called with a line for a person at each stage.
         progress: called with the share of a stage done, 0 to 1.
-        busy: whether to keep all cores busy meanwhile; else boards have more time for an answer.
 
     Returns:
-        The figures: `delays` as of `zero_delays`; `loop`, by how much an interval of the loop differs from its period
+        The figures: `delays` to zero; `loop`, by how much an interval of the loop differs from its period
         (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`; `hostile` messages,
         the `greatest_current` meanwhile and its limit `max_current` [A].
     """
@@ -273,14 +243,14 @@ def measure_bridge(
     from magnetosuture_thread.nodes.clients import CoilClient
     from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 
-    settings = read_setup(SETUP).coils
-    delays: list[dict[str, Any]] = []
+    setup = read_setup(SETUP)
+    settings, delays = setup.coils, list[dict[str, Any]]()
 
-    def add(event: str, found: list[float], bound: float) -> None:
-        delays.append(spread := zero_delays(event, found, bound))
-        log(f"  {event}: median {1e3 * spread['median']:.1f}, maximum {1e3 * spread['greatest']:.1f} ms")
+    def add(event: str, times: list[float], bound: float) -> None:
+        delays.append(spread := _spread(event, times, bound))
+        log(f"  {event}: median {spread['median']:.1f}, maximum {spread['greatest']:.1f} ms")
 
-    with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
+    with tempfile.TemporaryDirectory() as name, reserved_domain() as domain, ExitStack() as stack:
         folder = Path(name)
         ports = [str(folder / f"board_{index}") for index in range(2)]
         stage = PowerStage(ports, SUPPLY, RESISTANCE, INDUCTANCE)
@@ -288,32 +258,33 @@ def measure_bridge(
         alone = {"without_prediction": "slow", "speed_without_prediction": settings.max_speed, "pose_uncertainty": 0.01}
         boards = {"roboclaw_ports": ports, "roboclaw_addresses": [board.address for board in stage.boards]}
         parameters = {"driver": "roboclaw", **boards, "coil_resistance": RESISTANCE, **alone}
-        if not busy:  # a test, on a machine that others may keep busy
-            parameters["roboclaw_answer_timeout"] = 0.5
         file = folder / "parameters.yaml"
         file.write_text(yaml.safe_dump({"/**/coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
-        arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]
+        arguments = ["--params-file", str(setup.path), "--params-file", str(file)]
         # Not by shared memory: what a killed process leaves of it may keep a later one from being heard.
         environment = {**graph_environment(domain), "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-        logs = folder / "logs"
         stage.open()
-        try:
-            with environment_of(environment), NodeProcesses((), arguments, environment, logs) as nodes, _load(busy):
-                bench = BridgeBench(stage, nodes, CoilClient, logs, progress)
-                bench.start("coil_bridge")
-                bench.start("tracker")
-                log(f"{trials} times a commander that falls silent")
-                add("last command", bench.stop_trials(trials), settings.command_timeout + 1.0 / settings.rate)
-                with CoilClient() as client:
-                    loop, scheduling = loop_timing(client)
-                bench.start("commander")
-                for victim in PARTS:
-                    log(f"{kills} times kill -9 of the {victim}")
-                    add(f"kill -9 of {victim}", bench.kills(victim, kills), KILL_BOUND)
-                log(f"{hostile} hostile messages")
-                greatest = bench.fuzz(hostile)
-        finally:
-            stage.close()
+        stack.callback(stage.close)
+        stack.enter_context(environment_of(environment))
+        nodes = stack.enter_context(NodeProcesses((), arguments, environment, folder / "logs"))
+        for _ in range(os.cpu_count() or 1):  # keep every core busy
+            work = subprocess.Popen([sys.executable, "-c", "while True: pass"], start_new_session=True)
+            stack.callback(work.wait)
+            stack.callback(work.kill)
+        bench = BridgeBench(stage, nodes, CoilClient, folder / "logs", progress)
+        bench.start("coil_bridge")
+        bench.start("tracker")
+        log(f"{trials} times a commander that falls silent")
+        add("last command", bench.stop_trials(trials), settings.command_timeout + 1.0 / settings.rate)
+        with CoilClient() as client:
+            loop, scheduling = loop_timing(client)
+        bench.start("commander")
+        for victim in ("commander", "tracker", "coil_bridge"):
+            log(f"{kills} times kill -9 of the {victim}")
+            # The bound is driver_timeout, and the boards' own clock.
+            add(f"kill -9 of {victim}", bench.kills(victim, kills), 0.25)
+        log(f"{hostile} hostile messages")
+        greatest = bench.fuzz(hostile)
     return {
         "delays": delays,
         **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "hostile": hostile},
@@ -343,19 +314,6 @@ def loop_timing(client: CoilClient) -> tuple[list[float], str]:
     return [float(values[name]) for name in JITTER_KEYS], values[SCHEDULING]
 
 
-@contextmanager
-def _load(busy: bool) -> Iterator[None]:
-    """Keep every core busy, if asked to."""
-    work = [sys.executable, "-c", "while True: pass"]
-    hogs = [subprocess.Popen(work, start_new_session=True) for _ in range((os.cpu_count() or 1) * busy)]
-    try:
-        yield
-    finally:
-        for hog in hogs:
-            hog.kill()
-            hog.wait()
-
-
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
     option = parser.add_argument
@@ -364,24 +322,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--hostile", type=whole_number, default=10_000, metavar="N", help="hostile messages (default: 10000)")
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
-    given = options.trials, options.kills, options.hostile
-    with progress(console, "bridge") as advance:
-        figures = measure_bridge(*given, log=make_log(console), progress=advance)
-    console.print(bridge_table(figures))
+    log = terminal.log
+    with terminal.progress("bridge") as advance:
+        figures = measure_bridge(options.trials, options.kills, options.hostile, log, advance)
+    names = ("median", "p99", "greatest", "bound")
+    columns = {"": "{event}", **{name: f"{{{name}:.1f}}" for name in names}, "beyond": "{beyond}/{count}"}
+    title = "coil bridge with simulated boards, all cores busy; times in ms to zero of all duties"
+    terminal.print(figures_table(title, figures["delays"], columns))
+    loop = ", ".join(f"{value:.2f}" for value in figures["loop"])
+    log(f"loop at {figures['rate']:g} Hz, {figures['scheduling']}: off its period by {loop} ms (median, p99, maximum)")
+    log("{hostile} hostile messages: at most {greatest_current:.2f} A of {max_current:.2f} A".format(**figures))
     return figures, True
-
-
-def bridge_table(figures: dict[str, Any]) -> Table:
-    """Return the figures as a table that fits 80 columns."""
-    rows = []
-    for each in figures["delays"]:
-        values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest", "bound"))
-        rows.append((each["event"], *values, f"{each['beyond']}/{each['count']}"))
-    rows.append(("loop off its period", *(f"{value:.2f}" for value in figures["loop"]), "", ""))
-    current, limit = f"{figures['greatest_current']:.2f} A", f"{figures['max_current']:.2f} A"
-    rows.append((f"{figures['hostile']} hostile messages", "", "", current, limit, "alive"))
-    caption = f"zero: of the duties of all boards; loop at {figures['rate']:g} Hz, {figures['scheduling']}"
-    title, columns = "coil bridge with simulated boards, all cores busy; times in ms", ("median", "p99", "maximum")
-    return make_table(title, ("", *columns, "bound", "beyond"), rows, caption)

@@ -19,11 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks.network.hosts import TwoHosts
-from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
+from benchmarks.hosts import two_hosts
+from benchmarks.report import figures_table
+from magnetosuture_thread.commands.command import Terminal, whole_number
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import GraphError
 
@@ -38,24 +37,15 @@ AT_THE_DESK = ("thread_model", "path_follower", "console")
 # Not by TCP, whose packets wait for one that was lost.
 ENVIRONMENT = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}
 COMMAND_TIMEOUT = 0.2  # s, for a command that was on its way for 50 ms, and one after it that was lost
-BRIDGE = {
-    "coil_bridge:driver": "simulated",
-    "coil_bridge:autostart": "armed",
-    "coil_bridge:command_timeout": str(COMMAND_TIMEOUT),
-}
+BRIDGE = {"driver": "simulated", "autostart": "armed", "command_timeout": str(COMMAND_TIMEOUT)}
 # What is sent anew with every pose is not worth waiting for.
 BEST_EFFORT = {
     f"{node}:qos_overrides./{topic}.{end}.reliability": "best_effort"
     for topic, sender in (("needle/servo_cv", "path_follower"), ("thread/margins", "thread_model"))
     for node, end in ((sender, "publisher"), ("coil_bridge", "subscription"))
 }
-ROUNDS = 500  # of the setup's path, so that it does not end
 DRIVEN_TIME = 0.3  # s for which the coils must be driven before the cable is pulled
-RECENT = 0.1  # s since the last current that is not zero, with which the coils are taken for driven
-PULL_DELAY = 1.0  # s that may go by before, at random
-PULLED_TIME = (0.3, 4.0)  # s for which the cable is out, at random
 STOP_EVERY = 10  # cuts of which in one the emergency stop is pressed at the rig while the cable is out
-STILL_TIME = 2.0  # s for which a stopped bridge must stay at zero after the cable is back
 TIMEOUT = 60.0  # s for anything to happen ...
 START_TIMEOUT = 300.0  # ... but for the first start on a machine, which compiles
 
@@ -85,27 +75,20 @@ class CutReport:
     stops: int = 0
     stops_kept: int = 0
 
-    @property
-    def passed(self) -> bool:
-        """Whether the coils were at zero in time after every cut, and no stopped bridge went on by itself."""
-        return self.late == 0 and self.stops == self.stops_kept
-
     def to_json(self) -> dict[str, Any]:
         """Return the figures for a file [s]."""
-        times = {
-            f"{name}_{kind}": float(of(getattr(self, name)))
-            for name in ("zero", "resumed")
-            for kind, of in (("median", np.median), ("maximum", np.max))
-        }
-        names = ("delay", "loss", "late", "stops", "stops_kept")
-        return {"cuts": len(self.zero), **times, **{name: getattr(self, name) for name in names}}
+        figures = {**vars(self), "cuts": len(self.zero), "in_time": len(self.zero) - self.late}
+        for name in ("zero", "resumed"):
+            times = figures.pop(name)
+            figures |= {f"{name}_median": float(np.median(times)), f"{name}_maximum": max(times)}
+        return figures
 
 
 class CableBench:
     """The graph over two hosts, the cable between them, and what the bridge gives to the simulated rig.
 
     Args:
-        hosts: the rig's and the desk's.
+        execute: executes a command of the cable.
         processes: none of which may end.
 
     Attributes:
@@ -117,11 +100,11 @@ class CableBench:
         close: leaves the graph.
     """
 
-    def __init__(self, hosts: TwoHosts, processes: Sequence[NodeProcesses]) -> None:
+    def __init__(self, execute: Callable[[str], None], processes: Sequence[NodeProcesses]) -> None:
         from magnetosuture_thread.nodes import topics
         from magnetosuture_thread.nodes.clients import Recorder
 
-        self._hosts, self._processes, self._random = hosts, processes, random.Random(1)
+        self._execute, self._processes, self._random = execute, processes, random.Random(1)
         self._state, self._currents = topics.BRIDGE_STATE, topics.RIG_CURRENTS
         taken = [self._currents, self._state]
         recorder = Recorder(DOMAIN, taken, simulated_clock=False, receive=self._receive)
@@ -131,28 +114,28 @@ class CableBench:
 
     def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
         """Pull the cable at random moments."""
-        self._hosts.execute(f"impair {report.delay} {report.loss}")
+        self._execute(f"impair {report.delay} {report.loss}")
         self._wait(self._is_driven, "the coils are not driven", START_TIMEOUT)
         for number in range(cuts):
             self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
             progress((number + 1) / cuts)
-        self._hosts.execute("impair 0 0")
+        self._execute("impair 0 0")
 
     def _cut(self, report: CutReport, stops: bool) -> None:
         self._wait(self._is_driven, "the coils are not driven")
-        self.spin(self._random.uniform(0.0, PULL_DELAY))
-        self._wait(lambda: time.time() - self.driven < RECENT, "the coils are not driven")
-        self._hosts.execute("pull")
+        self.spin(self._random.uniform(0.0, 1.0))
+        self._wait(lambda: time.time() - self.driven < 0.1, "the coils are not driven")
+        self._execute("pull")
         pulled = time.time()
-        self.spin(self._random.uniform(*PULLED_TIME))
+        self.spin(self._random.uniform(0.3, 4.0))
         if stops:
             _press("stop")
         report.zero.append(max(0.0, self.driven - pulled))
         report.late += report.zero[-1] > COMMAND_TIMEOUT
-        self._hosts.execute("plug")
+        self._execute("plug")
         plugged, before = time.time(), self.driven
         if stops:
-            self.spin(STILL_TIME)
+            self.spin(2.0)  # s for which it must stay at zero
             report.stops += 1
             report.stops_kept += self.driven == before and not self.armed
             _press("reset", "arm")
@@ -169,8 +152,8 @@ class CableBench:
         """Take what comes until a condition holds; raise `GraphError` if it does not within the timeout [s]."""
         end = time.monotonic() + timeout
         while not condition():
-            for each in self._processes:
-                each.check()
+            for processes in self._processes:
+                processes.check()
             if time.monotonic() > end:
                 raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
             self.spin(0.02)
@@ -182,10 +165,10 @@ class CableBench:
             return
         message = self._currents.decode(data)
         if np.any(np.abs(message.current) > 0.0):
-            given = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-            if given - self.driven > DRIVEN_TIME:
-                self.since = given
-            self.driven = given
+            stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+            if stamp - self.driven > DRIVEN_TIME:
+                self.since = stamp
+            self.driven = stamp
 
 
 def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, progress: Progress) -> list[CutReport]:
@@ -199,26 +182,20 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
     Raises:
         GraphError: the hosts cannot be made, a node ended, or the coils are not driven.
     """
-    setup = read_setup(SETUP)
-    reports: list[CutReport] = []
-    with TwoHosts() as hosts, tempfile.TemporaryDirectory() as folder:
+    setup, reports = read_setup(SETUP), list[CutReport]()
+    with two_hosts() as (execute, desk_prefix), tempfile.TemporaryDirectory() as folder:
         # Imported here: threads that it starts have to be on the rig's host.
         from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment
 
         environment = {**graph_environment(DOMAIN), **ENVIRONMENT}
-        path = ",".join(map(str, (*setup.follower.waypoints,) * ROUNDS))
+        path = ",".join(map(str, (*setup.follower.waypoints,) * 500))  # so that it does not end
         shared = ["--params-file", str(setup.path.resolve()), *_parameters(BEST_EFFORT)]
-        at_the_rig = [*shared, *_parameters(BRIDGE)]
+        at_the_rig = [*shared, *_parameters({f"coil_bridge:{name}": value for name, value in BRIDGE.items()})]
         at_the_desk = [*shared, *_parameters({"path_follower:waypoints": f"[{path}]", "console:port": "0"})]
         log("starting the nodes at the rig and at the desk")
-        with (
-            environment_of(environment),
-            NodeProcesses(AT_THE_RIG, at_the_rig, environment, Path(folder, "rig")) as rig,
-            NodeProcesses(
-                AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=hosts.at_the_desk
-            ) as desk,
-            closing(CableBench(hosts, (rig, desk))) as bench,
-        ):
+        rig = NodeProcesses(AT_THE_RIG, at_the_rig, environment, Path(folder, "rig"))
+        desk = NodeProcesses(AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=desk_prefix)
+        with environment_of(environment), rig, desk, closing(CableBench(execute, (rig, desk))) as bench:
             for delay, loss, cuts in filter(lambda network: network[2], networks):
                 log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")
                 reports.append(CutReport(delay, loss))
@@ -247,25 +224,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option("--impaired-cuts", type=whole_number, default=50, metavar="N", help=text)
 
 
-def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any], bool]:
     """Pull the cable; return the figures, and whether the coils were at zero in time after each cut."""
     networks = [(0.0, 0.0, options.cuts), (DELAY, LOSS, options.impaired_cuts)]
-    with progress(console, "network") as advance:
-        reports = measure_network(networks, make_log(console), advance)
-    console.print(network_table(reports))
-    figures = {"bound": COMMAND_TIMEOUT, "networks": [report.to_json() for report in reports]}
-    return figures, all(report.passed for report in reports)
-
-
-def network_table(reports: list[CutReport]) -> Table:
-    """Return the figures of each network as a table."""
-    rows = []
-    for report in reports:
-        found = report.to_json()
-        zero, resumed = (
-            f"{found[f'{name}_median']:.3f}, {found[f'{name}_maximum']:.3f}" for name in ("zero", "resumed")
-        )
-        in_time, stops = f"{found['cuts'] - report.late} of {found['cuts']}", f"{report.stops_kept} of {report.stops}"
-        rows.append((f"{1e3 * report.delay:g} ms, {100.0 * report.loss:g} % lost", in_time, zero, resumed, stops))
-    columns = ("network", f"at zero within {COMMAND_TIMEOUT:g} s", "median, maximum [s]", "goes on [s]", "stops kept")
-    return make_table("Two hosts, simulated rig", columns, rows)
+    with terminal.progress("network") as advance:
+        reports = measure_network(networks, terminal.log, advance)
+    figures = [report.to_json() for report in reports]
+    columns = {
+        "network": "{delay:g} s, {loss:.0%} lost",
+        f"at zero within {COMMAND_TIMEOUT:g} s": "{in_time} of {cuts}",
+        "median, maximum [s]": "{zero_median:.3f}, {zero_maximum:.3f}",
+        "goes on [s]": "{resumed_median:.3f}, {resumed_maximum:.3f}",
+        "stops kept": "{stops_kept} of {stops}",
+    }
+    terminal.print(figures_table("Two hosts, simulated rig", figures, columns))
+    # No stopped bridge may go on by itself either.
+    passed = all(report.late == 0 and report.stops == report.stops_kept for report in reports)
+    return {"bound": COMMAND_TIMEOUT, "networks": figures}, passed

@@ -1,1 +1,0 @@
-"""The thread estimator against ground truth."""

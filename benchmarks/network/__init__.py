@@ -1,1 +1,0 @@
-"""Two hosts, and what happens to the coils when the cable between them is pulled."""
