@@ -74,7 +74,6 @@ class CorrectionBuffers(NamedTuple):
         solver: of the structured solver, with the factors of the last matrix.
         about: where the nodes are, shape (n + 1, 2) [D].
         moved: d, shape (n + 1, 2) [D].
-        known: nodes that are no unknowns, shape (n + 1,).
         covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
     """
 
@@ -82,7 +81,6 @@ class CorrectionBuffers(NamedTuple):
     solver: banded.SolverBuffers
     about: Points
     moved: Points
-    known: NDArray[np.bool_]
     covariance: NDArray[np.float64]
 
     @classmethod
@@ -90,7 +88,7 @@ class CorrectionBuffers(NamedTuple):
         """Return buffers for a thread of so many nodes."""
         program, (about, moved) = StepBuffers.of(nodes, 2, 3 * (nodes - 1) + 1), np.zeros((2, nodes, 2))
         solver = BandedSolver().buffers(nodes, 2, len(program.first))
-        return cls(program, solver, about, moved, np.zeros(nodes, dtype=np.bool_), np.zeros((nodes, 2, 2)))
+        return cls(program, solver, about, moved, np.zeros((nodes, 2, 2)))
 
 
 def normals_of(positions: Points) -> Points:
@@ -276,7 +274,7 @@ def correct(
     Args:
         rod: the thread.
         workspace: obstacles and wall [m].
-        work: the program holds Lambda and `known` is read; `about` gets the corrected thread, `moved` the correction,
+        work: the program holds Lambda and the known nodes; `about` gets the corrected thread, `moved` the correction,
             `covariance` what is left.
         start: the predicted nodes, shape (n + 1, 2) [D].
         heading: of the needle, shape (2,).
@@ -288,7 +286,7 @@ def correct(
         allowed, at most 1 where they hold; the largest residual of the last solve.
     """
     buffers, segments, contacts = work.program, len(start) - 1, 0
-    known, about, moved = work.known, work.about, work.moved
+    known, about, moved = buffers.known, work.about, work.moved
     about[:], moved[:], buffers.multipliers[:], buffers.push[:] = start, 0.0, 0.0, 0.0
     residual = np.empty(len(points.place))
     solves, change, off, largest, row = 0, 1.0, np.inf, 0.0, segments
@@ -296,15 +294,15 @@ def correct(
         if change > CHANGED:
             row = measured_rows(points, scale, start, segments, buffers)
         mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
-        strain = segment_rows(buffers, about, start, known, 1.0)
-        contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
+        strain = segment_rows(buffers, about, start, 1.0)
+        contacts, depth = contact_rows(buffers, row, workspace, about, start, 1.0, rod.unit, rod.radius, True)
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         done = off <= 1.0 and change <= CHANGED and largest <= RESIDUAL_TOLERANCE
         if contacts < 0 or (solves > 0 and (done or solves >= MAX_SOLVES)):
             break
         rows = row + contacts
         u, multipliers = moved.copy(), buffers.multipliers[:rows].copy()
-        program = program_of(buffers, known, rows)
+        program = program_of(buffers, rows)
         banded.solve(program, u, multipliers, work.solver)
         solves, largest = solves + 1, max(compiled_residuals(program, u, multipliers))
         if not largest < np.inf:
@@ -362,7 +360,7 @@ class Corrector:
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
         self._formulation, self._work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
-        self._work.known[[0, *predictor.fixed_nodes]] = True
+        self._work.program.known[[0, *predictor.fixed_nodes]] = True
 
     def solve(self, prior: Prior, points: MeasuredPoints) -> Correction:
         """Solve the program about a predicted thread; the weights of the points are written."""

@@ -38,7 +38,7 @@ from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import PredictorOptions, ThreadPredictor
-from magnetosuture_thread.thread.program import ABOUT, CONTACTS_PER_NODE, Table
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, Table
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation, StepInput
 from magnetosuture_thread.thread.step import WarmStart
 
@@ -358,16 +358,14 @@ class _ThreadWalk:
                 self.converged = False
                 room = f"more than {CONTACTS_PER_NODE * len(self.positions)} contacts at once"
                 return room if progress.code == NO_ROOM else "a step has no solution within the tolerance"
-            (self.positions, self._velocities), self._interval = formulation.buffers.end, interval / count
+            (self.positions, self._velocities), self._interval = formulation.buffers.end[:2], interval / count
             self.converged = self.converged and progress.off <= 1.0
         return ""
 
     def write_forces(self, heading: Vector, tension: Vector, pull: Vector) -> None:
         """Write the tension of each segment and the thread's pull upon the needle [N]."""
         buffers = self._formulation.buffers
-        loads = buffers.internal, buffers.tail_load
-        moved = buffers.motion[ABOUT], self._velocities, self._interval
-        self._formulation.write_forces(*moved, heading, loads, tension, pull)
+        self._formulation.write_forces((buffers.end, buffers.tail_load), self._interval, heading, tension, pull)
 
 
 class ThreadForecaster:

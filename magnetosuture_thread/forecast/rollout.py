@@ -14,7 +14,7 @@ from magnetosuture_thread.geometry.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.compiled import compiled, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts, half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.barriers import segment_rows_of
+from magnetosuture_thread.thread.barriers import link_margins
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.program import Indices, Mask, Table, Vector
 
@@ -194,7 +194,7 @@ def least_margins(
     """
     for k in range(len(vertices)):
         points, least = vertices[k], margin[k]
-        segment_rows_of(rod, points, headings[k], work, rows)
+        link_margins(rod, points, headings[k], work, rows)
         for kind in (CONNECTIVITY_MARGIN, COMPRESSION_MARGIN):
             for i in range(rows.shape[1]):
                 left = rows[1, i] if kind == CONNECTIVITY_MARGIN else rows[3, i]

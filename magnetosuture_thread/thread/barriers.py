@@ -20,22 +20,59 @@ from magnetosuture_thread.geometry.barrier import (
     BarrierRows,
     RowBarrier,
 )
-from magnetosuture_thread.geometry.compiled import compiled_uncounted
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
 from magnetosuture_thread.geometry.obstacles import (
-    Contacts,
     Workspace,
     WorkspaceData,
-    find_contacts,
     half_segment_distance,
+    nearest_edge,
     wall_contact,
 )
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.mechanics import RodProperties, chord_lengths
 
+Vector = NDArray[np.float64]
+Table = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@compiled_inline
+def distance_row(points: Points, i: int, j: int, rest: float) -> tuple[float, float]:
+    """Return h = (rest^2 - |x_j - x_i|^2) / 2, with the gradient x_j - x_i by x_i, and the distance |x_j - x_i|."""
+    square = 0.0
+    for a in range(points.shape[1]):
+        square += (points[j, a] - points[i, a]) ** 2
+    return 0.5 * (rest * rest - square), math.sqrt(square)
+
+
+@compiled
+def _write_distances(points: Points, apart: int, rest: Vector, value: Vector, distance: Vector) -> None:
+    for i in range(len(value)):
+        value[i], distance[i] = distance_row(points, i, i + apart, rest[i])
+
+
+class _DistanceBarrier(RowBarrier):
+    """A barrier of the distances of nodes some segments apart, h = +-(rest^2 - |x_i - x_{i-apart}|^2) / 2."""
+
+    apart, sign = 1, 1.0
+
+    def _rows(self, positions: Points, rest: float | Vector) -> BarrierRows:
+        along, first = positions[self.apart :] - positions[: -self.apart], np.arange(len(positions) - self.apart)
+        rests, (value, distance) = np.array(np.broadcast_to(rest, first.shape), np.float64), np.empty((2, len(first)))
+        _write_distances(np.array(positions, np.float64), self.apart, rests, value, distance)
+        return BarrierRows(
+            name=self.name,
+            nodes=np.column_stack([first, first + self.apart]),
+            obstacle=np.full(len(first), NO_OBSTACLE),
+            value=self.sign * value,
+            gradient=self.sign * np.stack([along, -along], axis=1),
+            clearance=self.sign * (rest - distance),
+        )
+
 
 @dataclass(frozen=True)
-class Connectivity(RowBarrier):
+class Connectivity(_DistanceBarrier):
     """No segment is longer than its rest length.
 
         h_con,i = (D^2 - |x_i - x_{i-1}|^2) / 2,    i = 1 ... n
@@ -53,11 +90,11 @@ class Connectivity(RowBarrier):
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _distance_rows(positions, 1, self.segment_length, self.name, 1.0)
+        return self._rows(positions, self.segment_length)
 
 
 @dataclass(frozen=True)
-class EnhancedConnectivity(RowBarrier):
+class EnhancedConnectivity(_DistanceBarrier):
     """No two nodes with one between them are farther apart than two rest lengths.
 
         h_enh,i = ((2 D)^2 - |x_i - x_{i-2}|^2) / 2,    i = 2 ... n
@@ -73,16 +110,16 @@ class EnhancedConnectivity(RowBarrier):
         segment_length: D, in the unit of the positions.
     """
 
-    name = ENHANCED_CONNECTIVITY
+    name, apart = ENHANCED_CONNECTIVITY, 2
     segment_length: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n - 1 rows at positions of shape (n + 1, d)."""
-        return _distance_rows(positions, 2, 2.0 * self.segment_length, self.name, 1.0)
+        return self._rows(positions, 2.0 * self.segment_length)
 
 
 @dataclass(frozen=True)
-class Compression(RowBarrier):
+class Compression(_DistanceBarrier):
     """No segment is shorter than its rest length.
 
         h_cmp,i = (|x_i - x_{i-1}|^2 - D_i^2) / 2,    i = 1 ... n
@@ -97,28 +134,35 @@ class Compression(RowBarrier):
         segment_length: D_i, of all segments or of each, shape (n,), in the unit of the positions.
     """
 
-    name = COMPRESSION
-    segment_length: float | NDArray[np.float64]
+    name, sign = COMPRESSION, -1.0
+    segment_length: float | Vector
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _distance_rows(positions, 1, self.segment_length, self.name, -1.0)
+        return self._rows(positions, self.segment_length)
 
 
-def _distance_rows(
-    positions: Points, apart: int, max_distance: float | NDArray[np.float64], name: str, sign: float
-) -> BarrierRows:
-    """Return the rows h_i = sign (max_distance_i^2 - |x_{i + apart} - x_i|^2) / 2."""
-    along, first = positions[apart:] - positions[:-apart], np.arange(len(positions) - apart)
-    square = np.einsum("id,id->i", along, along)
-    return BarrierRows(
-        name=name,
-        nodes=np.column_stack([first, first + apart]),
-        obstacle=np.full(len(first), NO_OBSTACLE),
-        value=0.5 * sign * (np.square(max_distance) - square),
-        gradient=sign * np.stack([along, -along], axis=1),
-        clearance=sign * (max_distance - np.sqrt(square)),
-    )
+@compiled_uncounted
+def link_margins(rod: RodProperties, points: Points, heading: Points, work: Points, rows: Table) -> None:
+    """Write value and clearance of connectivity, then of compression, and the chords that the segments keep.
+
+    Args:
+        rod: the thread.
+        points: nodes, shape (n + 1, d) [m].
+        heading: unit vector along the needle, shape (d,).
+        work: memory, shape (n + 1, d).
+        rows: written, shape (5, n) [m^2], [m], [m^2], [m], [m].
+    """
+    for i in range(len(points)):
+        for a in range(points.shape[1]):
+            work[i, a] = points[i, a] / rod.unit
+    chord_lengths(work, heading, rod.clamped, rows[4])
+    for i in range(len(points) - 1):
+        chord = rows[4, i] * rod.unit
+        stretched, length = distance_row(points, i, i + 1, rod.unit)
+        pressed, _ = distance_row(points, i, i + 1, chord)
+        rows[0, i], rows[1, i] = stretched, rod.unit - length
+        rows[2, i], rows[3, i], rows[4, i] = -pressed, length - chord, chord
 
 
 @dataclass(frozen=True)
@@ -156,77 +200,66 @@ class SolidRows(NamedTuple):
 
     node: NDArray[np.uint32]
     obstacle: NDArray[np.int32]
-    value: NDArray[np.float64]
-    clearance: NDArray[np.float64]
+    value: Vector
+    clearance: Vector
     normal: Points
 
     @classmethod
     def room(cls, count: int, dimension: int) -> SolidRows:
         """Return arrays for a number of rows."""
-        value, clearance = np.empty((2, count))
-        return cls(
-            np.empty(count, np.uint32), np.empty(count, np.int32), value, clearance, np.empty((count, dimension))
-        )
+        indices, (value, clearance) = (np.empty(count, np.uint32), np.empty(count, np.int32)), np.empty((2, count))
+        return cls(*indices, value, clearance, np.empty((count, dimension)))
 
 
 @compiled_uncounted
 def solid_rows(
-    points: Points, around: WorkspaceData, radius: float, contacts: Contacts, rows: SolidRows
+    points: Points, around: WorkspaceData, radius: float, nearby: Indices, rows: SolidRows
 ) -> tuple[int, int]:
-    """Write the row of each node and each obstacle that is near, then of each node and the wall.
+    """Write the row of each node and each obstacle within reach, then of each node and the wall.
 
     Args:
         points: nodes, shape (n + 1, d) [m].
         around: obstacles and wall.
         radius: of the thread [m].
-        contacts: memory.
-        rows: written; with as much room.
+        nearby: block of each shape that is near the last node, as a guess for the next, shape (o,).
+        rows: written; with room for a row of each node and each obstacle, and of each node and the wall.
 
     Returns:
-        The number of rows, and of those of obstacles; -1 and 0 when there is no room for all contacts.
+        The number of rows, and of those of obstacles.
     """
-    found = find_contacts(points, around, contacts)
-    written, obstacles = 0, 0
+    discs, boxes, reach, count, obstacles = len(around.discs), around.boxes, around.reach, 0, 0
     for kind in range(2):
-        for c in range(found):
-            i, o = contacts.node[c], contacts.obstacle[c]
-            if contacts.nearest[c] and (o == DISH_WALL) == (kind == 1):
-                least = half_segment_distance(points, i, o, contacts.distance[c], around)
-                rows.node[written], rows.obstacle[written] = i, o
-                rows.value[written], rows.clearance[written] = contacts.distance[c] - radius, least - radius
-                for a in range(points.shape[1]):
-                    rows.normal[written, a] = contacts.normal[c, a]
-                written += 1
+        for i in range(len(points)):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2] if points.shape[1] == 3 else 0.0
+            for o in range(len(around.order) if kind == 0 else 1):
+                s, obstacle, nz = around.order[o] if kind == 0 else 0, o if kind == 0 else DISH_WALL, 0.0
+                if kind == 1:
+                    distance, nx, ny = wall_contact(x, y, around.wall_radius)
+                elif s < discs:
+                    nx, ny, nz = x - around.discs[s, 0], y - around.discs[s, 1], z - around.discs[s, 3]
+                    away = math.sqrt(nx * nx + ny * ny + nz * nz)
+                    distance = away - around.discs[s, 2]
+                    nx, ny, nz = (nx / away, ny / away, nz / away) if away > 0.0 else (1.0, 0.0, 0.0)
+                elif (
+                    boxes[s - discs, 0] - reach <= x <= boxes[s - discs, 2] + reach
+                    and boxes[s - discs, 1] - reach <= y <= boxes[s - discs, 3] + reach
+                ):
+                    nearest = nearest_edge(x, y, s - discs, nearby[o], around)
+                    distance, nx, ny, nearby[o] = nearest.signed, nearest.x, nearest.y, nearest.block
+                else:
+                    continue
+                if not (distance <= reach):
+                    continue
+                least = half_segment_distance(points, i, obstacle, distance, around)
+                rows.node[count], rows.obstacle[count] = i, obstacle
+                rows.value[count], rows.clearance[count] = distance - radius, least - radius
+                rows.normal[count, 0], rows.normal[count, 1] = nx, ny
+                if points.shape[1] == 3:
+                    rows.normal[count, 2] = nz
+                count += 1
         if kind == 0:
-            obstacles = written
-    return (written, obstacles) if found >= 0 else (-1, 0)
-
-
-@compiled_uncounted
-def segment_rows_of(
-    rod: RodProperties, points: Points, heading: Points, work: Points, rows: NDArray[np.float64]
-) -> None:
-    """Write value and clearance of the rows of connectivity, then of compression, and the chords they keep.
-
-    Args:
-        rod: the thread.
-        points: nodes, shape (n + 1, d) [m].
-        heading: unit vector along the needle, shape (d,).
-        work: memory, shape (n + 1, d).
-        rows: written, shape (5, n) [m^2], [m], [m^2], [m], [m].
-    """
-    chords = rows[4]
-    for i in range(len(points)):
-        for a in range(points.shape[1]):
-            work[i, a] = points[i, a] / rod.unit
-    chord_lengths(work, heading, rod.clamped, chords)
-    for i in range(len(chords)):
-        square = 0.0
-        for a in range(points.shape[1]):
-            square += (points[i + 1, a] - points[i, a]) ** 2
-        length, chords[i] = math.sqrt(square), chords[i] * rod.unit
-        rows[0, i], rows[1, i] = 0.5 * (rod.unit * rod.unit - square), rod.unit - length
-        rows[2, i], rows[3, i] = 0.5 * (square - chords[i] * chords[i]), length - chords[i]
+            obstacles = count
+    return count, obstacles
 
 
 @dataclass(frozen=True)

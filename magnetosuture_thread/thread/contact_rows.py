@@ -27,12 +27,12 @@ from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     BEFORE,
+    CONTACT,
     GRIPS,
     NO_SHAPE,
     SPAN,
     START,
     GripBuffers,
-    Mask,
     RodBuffers,
     StepBuffers,
     Vector,
@@ -50,7 +50,6 @@ def contact_rows(
     workspace: WorkspaceData,
     about: Points,
     start: Points,
-    known: Mask,
     interval: float,
     unit: float,
     radius: float,
@@ -67,7 +66,6 @@ def contact_rows(
         workspace: obstacles and wall [m].
         about: y, shape (n + 1, d) [D].
         start: x, shape (n + 1, d) [D].
-        known: nodes that have no rows, as nothing can push them, shape (n + 1,).
         interval: dt [s].
         unit: D [m].
         radius: rho [m].
@@ -81,7 +79,7 @@ def contact_rows(
     # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
     node, obstacle, place = contacts.node, contacts.obstacle, contacts.place
     distance, normal = contacts.distance, contacts.normal
-    gradient, lower, upper, push = buffers.gradient, buffers.lower, buffers.upper, buffers.push
+    gradient, lower, upper, push, known = buffers.gradient, buffers.lower, buffers.upper, buffers.push, buffers.known
     for i in range(nodes):
         minimum[i, 0] = minimum[i, 1] = np.inf
         for a in range(dimension):
@@ -134,13 +132,7 @@ def contact_rows(
 
 @compiled_uncounted
 def stays_clear(
-    buffers: StepBuffers,
-    workspace: WorkspaceData,
-    before: Points,
-    about: Points,
-    known: Mask,
-    unit: float,
-    radius: float,
+    buffers: StepBuffers, workspace: WorkspaceData, before: Points, about: Points, unit: float, radius: float
 ) -> bool:
     """Return whether no contact is deeper than `DEPTH_TOLERANCE`, once nodes have moved since rows were written.
 
@@ -152,11 +144,10 @@ def stays_clear(
         workspace: obstacles and wall [m].
         before: where rows were written, shape (n + 1, d) [D].
         about: where the nodes are, shape (n + 1, d) [D].
-        known: nodes that have no rows, shape (n + 1,).
         unit: D [m].
         radius: rho [m].
     """
-    points, clearance, minimum = buffers.work[0], buffers.clearance, radius - DEPTH_TOLERANCE
+    points, clearance, minimum, known = buffers.work[0], buffers.clearance, radius - DEPTH_TOLERANCE, buffers.known
     for i in range(len(about)):
         for a in range(about.shape[1]):
             points[i, a] = about[i, a] * unit
@@ -189,7 +180,7 @@ def keep_pushes(buffers: RodBuffers, rows: int, row: int) -> None:
         rows: of the program.
         row: the first row of the contacts.
     """
-    program, contacts, force = buffers.program, buffers.program.contacts, buffers.contact_force
+    program, contacts, force = buffers.program, buffers.program.contacts, buffers.end[CONTACT]
     force[:] = 0.0
     program.push[:] = 0.0
     for r in range(row, rows):
@@ -225,7 +216,7 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
         The number of rows, -1 if there is no room for them; and by how much the limits differ from those of the last
         solve, over the greatest of them.
     """
-    buffers, grips, known, contacts = rod.program, rod.grips, rod.known, rod.program.contacts
+    buffers, grips, known, contacts = rod.program, rod.grips, rod.program.known, rod.program.contacts
     best, before, start = grips.contact, rod.motion[BEFORE], rod.motion[START]
     shapes, forces, gradient, lower, upper = grips.shape, grips.force, buffers.gradient, buffers.lower, buffers.upper
     node, obstacle, place, normal = contacts.node, contacts.obstacle, contacts.place, contacts.normal

@@ -11,7 +11,19 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.margins import FrictionState
 from magnetosuture_thread.thread.mechanics import RodProperties
-from magnetosuture_thread.thread.program import BEFORE, SPAN, START, VELOCITIES, RodBuffers, Table, Vector
+from magnetosuture_thread.thread.program import (
+    BEFORE,
+    CONTACT,
+    END,
+    END_VELOCITIES,
+    INTERNAL,
+    SPAN,
+    START,
+    VELOCITIES,
+    RodBuffers,
+    Table,
+    Vector,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +100,8 @@ def keep_internal_forces(buffers: RodBuffers, rows: int, interval: float) -> Non
     """
     program, motion, velocities = buffers.program, buffers.motion, buffers.motion[VELOCITIES]
     nodes, dimension = velocities.shape
-    internal, load, multipliers = buffers.internal, buffers.tail_load, program.multipliers
+    internal, contact, load = buffers.end[INTERNAL], buffers.end[CONTACT], buffers.tail_load
+    multipliers = program.multipliers
     blocks, couplings, contacts = program.blocks, program.couplings, program.contacts
     for i in range(nodes):
         for a in range(dimension):
@@ -105,46 +118,39 @@ def keep_internal_forces(buffers: RodBuffers, rows: int, interval: float) -> Non
             for a in range(dimension):
                 internal[program.first[row] + k, a] += multipliers[row] * program.gradient[row, k, a]
     for a in range(dimension):
-        load[a] = buffers.contact_force[0, a] - buffers.drag_linear[0, a]
+        load[a] = contact[0, a] - buffers.drag_linear[0, a]
         for b in range(dimension):
             load[a] -= buffers.drag[0, a, b] * (motion[START, 0, b] - motion[BEFORE, 0, b]) / interval
     # A row of a contact has no gradient at a node that is known, whose share is with the needle.
     for row in range(nodes - 1, rows):
         c = row - nodes + 1
-        if buffers.known[0] and contacts.node[c] == 0 and program.limit[row] == np.inf:
+        if program.known[0] and contacts.node[c] == 0 and program.limit[row] == np.inf:
             for a in range(dimension):
                 load[a] += (1.0 - contacts.place[c]) * contacts.normal[c, a] * multipliers[row]
 
 
 @compiled
 def write_forces(
-    rod: RodProperties,
-    positions: Points,
-    velocities: Points,
-    heading: Points,
-    internal: Points,
-    tail_load: Vector,
-    scale: float,
-    tension: Vector,
-    force: Vector,
-) -> float:
+    rod: RodProperties, end: Table, tail_load: Vector, interval: float, heading: Points, tension: Vector, force: Vector
+) -> tuple[float, float]:
     """Write the tension of each segment [N] and the force upon the needle [N]; return the moment about its tail [N m].
 
     Args:
         rod: its properties.
-        positions: of all nodes at the end of the step, in segment lengths, shape (n + 1, d).
-        velocities: of all nodes [m/s].
-        heading: unit vector along the needle, shape (d,).
-        internal: what the segments push each node with, see `keep_internal_forces`, shape (n + 1, d).
+        end: of the step, see `RodBuffers`.
         tail_load: what medium and contacts push node 0 with, shape (d,).
-        scale: force of a unit of these [N].
+        interval: duration of the step [s].
+        heading: unit vector along the needle, shape (d,).
         tension: written, shape (n,).
         force: written, shape (d,).
 
     Returns:
-        The moment, counter-clockwise; 0 of a pinned thread, NaN in space, where it is no single number.
+        The moment, counter-clockwise; 0 of a pinned thread, NaN in space, where it is no single number; and the force
+        of a unit of the loads [N].
     """
+    positions, internal = end[END], end[INTERNAL]
     nodes, dimension = positions.shape
+    scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
     tangent, passed = np.zeros(dimension), np.zeros(dimension)
     for a in range(dimension):
         force[a] = scale * (internal[0, a] + tail_load[a])
@@ -162,17 +168,20 @@ def write_forces(
     # The end correction takes some of the load on the last segment from the node behind its middle.
     along = 0.0
     for a in range(dimension):
-        slip = velocities[nodes - 1, a] - rod.flow[a]
+        slip = end[END_VELOCITIES, nodes - 1, a] - rod.flow[a]
         along += tangent[a] * (rod.mass_per_length * rod.gravity[a] - rod.drag_along * slip)
     tension[nodes - 2] += mechanics.END_CORRECTION * rod.unit * along
     if not rod.clamped:
-        return 0.0
+        return 0.0, scale
     if dimension != 2:
-        return np.nan
-    work, gradient = np.zeros((2, nodes, dimension)), np.zeros((nodes, dimension))
-    mechanics.bending_gradient(positions, heading, rod.clamped, rod.rest_angles, work, gradient)
+        return np.nan, scale
+    work, points = np.zeros((3, nodes, dimension)), np.empty((nodes, dimension))
+    for i in range(nodes):
+        for a in range(dimension):
+            points[i, a] = positions[i, a] / rod.unit
+    mechanics.bending_gradient(points, heading, rod.clamped, rod.rest_angles, work, work[2])
     bending = rod.bending_stiffness / rod.unit
-    return float(-2.0 * bending * (work[1, 0, 1] * heading[0] - work[1, 0, 0] * heading[1]))
+    return -2.0 * bending * (work[1, 0, 1] * heading[0] - work[1, 0, 0] * heading[1]), scale
 
 
 def friction_of(grip: Table) -> tuple[Vector, Vector]:

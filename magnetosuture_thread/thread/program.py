@@ -35,6 +35,9 @@ NO_SHAPE = -2  # in place of a shape
 BEFORE, START, LAST, VELOCITIES, ABOUT, LAST_ABOUT = range(6)
 """Of a step's motion: where the nodes are; the same with the prescribed nodes moved; velocities over the last step; of
 this step, better with each solve; where they lead; where the program was written about."""
+END, END_VELOCITIES, INTERNAL, CONTACT = range(4)
+"""Of a step's end: where the nodes are [m] and their velocities over the step [m/s]; what the segments push each node
+with; and what contacts do, with friction."""
 SOLVED = "solved"  # every solver's word for a solution at the first attempt
 
 
@@ -97,6 +100,7 @@ class StepBuffers(NamedTuple):
     blocks: Table
     couplings: Table
     linear: Points
+    known: Mask
     first: Indices
     gradient: Table
     lower: Vector
@@ -121,6 +125,7 @@ class StepBuffers(NamedTuple):
             np.zeros((nodes, dimension, dimension)),
             np.zeros((SPAN, nodes)),
             np.zeros((nodes, dimension)),
+            np.zeros(nodes, np.bool_),
             np.zeros(total, np.int64),
             np.zeros((total, SPAN, dimension)),
             lower,
@@ -159,43 +164,40 @@ class RodBuffers(NamedTuple):
         program: its programs.
         grips: its friction.
         motion: positions and velocities of the step, see `BEFORE` and what follows it, shape (6, n + 1, d).
-        known: the prescribed nodes, shape (n + 1,).
         drag: the medium's part of `blocks`, shape (n + 1, d, d).
         drag_linear: the medium's part of `linear`, shape (n + 1, d).
-        internal: what the segments push each node with, shape (n + 1, d).
-        contact_force: what contacts push each node with, with friction, shape (n + 1, d).
+        end: positions [m] and velocities [m/s] at the end of the step, and forces, see `END` and what follows it, shape
+            (4, n + 1, d).
         tail_load: what medium and contacts do at the needle's tail, shape (d,).
-        end: positions [m] and velocities [m/s] at the end of the step, shape (2, n + 1, d).
+        links: connectivity and compression at the end of the step, see `link_margins`, shape (5, n).
+        residuals: the largest of each kind over the step's solves, see `Residuals`, shape (3,).
     """
 
     program: StepBuffers
     grips: GripBuffers
     motion: Table
-    known: Mask
     drag: Table
     drag_linear: Points
-    internal: Points
-    contact_force: Points
-    tail_load: Vector
     end: Table
+    tail_load: Vector
+    links: Table
+    residuals: Vector
 
     @classmethod
-    def of(cls, program: StepBuffers, dimension: int) -> RodBuffers:
+    def of(cls, program: StepBuffers) -> RodBuffers:
         """Return buffers for a rod with these programs."""
-        nodes = len(program.linear)
+        nodes, dimension = program.linear.shape
         places = (2, nodes, GRIPS)
-        drag_linear, internal, contact_force = np.zeros((3, nodes, dimension))
         return cls(
             program,
             GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1)),
             np.zeros((6, nodes, dimension)),
-            np.zeros(nodes, np.bool_),
             np.zeros((nodes, dimension, dimension)),
-            drag_linear,
-            internal,
-            contact_force,
+            np.zeros((nodes, dimension)),
+            np.zeros((4, nodes, dimension)),
             np.zeros(dimension),
-            np.zeros((2, nodes, dimension)),
+            np.zeros((5, nodes - 1)),
+            np.zeros(3),
         )
 
     @property
@@ -204,19 +206,14 @@ class RodBuffers(NamedTuple):
         program = self.program
         return program.multipliers[: len(program.linear) - 1], program.push, self.grips.shape, self.grips.force
 
-    def restore(self, memory: tuple[NDArray[Any], ...]) -> None:
-        """Restore what another rod's or an earlier `memory` had."""
-        for array, kept in zip(self.memory, memory, strict=True):
-            array[:] = kept
 
-
-def first_rows(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
+def first_rows(buffers: StepBuffers, rows: int) -> ChainProgram:
     """Return the program of the first rows."""
     return ChainProgram(
         buffers.blocks,
         buffers.couplings,
         buffers.linear,
-        known,
+        buffers.known,
         buffers.first[:rows],
         buffers.gradient[:rows],
         buffers.lower[:rows],
