@@ -44,15 +44,7 @@ from magnetosuture_thread.geometry.compiled import (
     compiled_within,
 )
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.program import (
-    SPAN,
-    ChainProgram,
-    Mask,
-    Solution,
-    Table,
-    Vector,
-    residuals_of,
-)
+from magnetosuture_thread.thread.program import SPAN, ChainProgram, Mask, Solution, Table, Vector, residuals_of
 
 Axes = tuple[int, ...]
 
@@ -127,14 +119,7 @@ def substitute(axes: Axes, band: Table, x: Vector) -> None:
 
 MAX_WEIGHT = 1e7  # w_max over the scale of P: the least compliance that is exact at once
 ROUNDING_RESIDUAL = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
-STATUS = (
-    "solved",
-    "iteration limit",
-    "not positive definite",
-    "not finite",
-    "stalled",
-    "solved, after a cold start",
-)
+STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "stalled", "solved, after a cold start")
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED, RESTARTED = range(6)
 
 

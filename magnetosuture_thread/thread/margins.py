@@ -184,12 +184,7 @@ class Margins(Mapping[str, BarrierMargins]):
         return replace(self, friction=friction)
 
     @classmethod
-    def of(
-        cls,
-        barriers: Sequence[BarrierMargins],
-        contact_tolerance: float,
-        scene_version: str = "",
-    ) -> Margins:
+    def of(cls, barriers: Sequence[BarrierMargins], contact_tolerance: float, scene_version: str = "") -> Margins:
         """Return the margins of barriers at the same positions.
 
         Args:

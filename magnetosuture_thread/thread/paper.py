@@ -41,13 +41,7 @@ from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_ro
 from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.program import SPAN, Solver, Table, first_rows
-from magnetosuture_thread.thread.step import (
-    AddedRows,
-    Formulation,
-    PrescribedMotion,
-    StepResult,
-    ThreadState,
-)
+from magnetosuture_thread.thread.step import AddedRows, Formulation, PrescribedMotion, StepResult, ThreadState
 
 MAX_ELONGATION = 1.5  # of the thread; slacks that give way by more hold nothing together, whatever the residuals say
 

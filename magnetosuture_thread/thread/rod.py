@@ -490,12 +490,7 @@ class RodFormulation(Formulation):
     has_friction = True
 
     def __init__(
-        self,
-        thread: Thread,
-        workspace: Workspace,
-        solver: Solver,
-        tolerance: float,
-        barriers: Sequence[Barrier] = (),
+        self, thread: Thread, workspace: Workspace, solver: Solver, tolerance: float, barriers: Sequence[Barrier] = ()
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
         self.buffers = RodBuffers.of(self._program)
