@@ -68,7 +68,7 @@ def add_pull(
         -lever * across / drag.turning,
     )
     ratio = (drag.whole / drag.bare, drag.whole / drag.across, lever * lever * drag.whole / drag.turning)
-    begins = np.isnan(added[0])
+    begins = math.isnan(added[0])
     for k in range(3):
         added[k] = full[k] if begins else added[k] + (full[k] - added[k]) / (1.0 + ratio[k])
         limit = speed if k < 2 else (speed / lever if lever > 0.0 else 0.0)
@@ -107,7 +107,7 @@ def step_needle(
     """
     needle = pose_needle(data, pose[0], pose[1], pose[2], pose[3])
     margin, shape = needle_margin(data, needle)
-    elapsed = np.inf if np.isnan(last[0]) else interval
+    elapsed = np.inf if math.isnan(last[0]) else interval
     velocity = filter_velocity(data, needle, command, slowdown, (last[0], last[1]), elapsed, touched)
     if drag.along > 0.0:
         commanded = min(math.hypot(command[0], command[1]), data.max_speed)

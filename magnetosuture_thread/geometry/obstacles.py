@@ -14,7 +14,13 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.compiled import (
+    compiled,
+    compiled_inline,
+    compiled_inner,
+    compiled_uncounted,
+    compiled_within,
+)
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.shapes import MIN_EXTENT, Disc, Obstacle, Polygon, triangulate
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
@@ -148,7 +154,7 @@ def pack_obstacles(
     )
 
 
-@compiled
+@compiled_inline
 def closest_on_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> tuple[float, float, float]:
     """Return the point of a segment ab that is closest to p, and where it is on the segment.
 
@@ -256,7 +262,7 @@ def add_row(start: int, count: int, length: float, direction: tuple[float, float
     return count + 1
 
 
-@compiled_uncounted
+@compiled_inner
 def search_block(
     x: float, y: float, reach: float, block: int, data: WorkspaceData, start: int, count: int, rows: ContactRows
 ) -> Nearest:
@@ -317,7 +323,7 @@ def search_block(
     return Nearest(count, best, sign * length, nx, ny, edge, block)
 
 
-@compiled_uncounted
+@compiled_inner
 def polygon_rows(
     x: float, y: float, polygon: int, reach: float, data: WorkspaceData, count: int, rows: ContactRows
 ) -> Nearest:
@@ -343,7 +349,7 @@ def polygon_rows(
     return Nearest(count, best.square, best.signed, best.x, best.y, best.edge, best.block)
 
 
-@compiled_uncounted
+@compiled_inner
 def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceData) -> Nearest:
     """Return the nearest boundary point of a polygon.
 
@@ -373,7 +379,7 @@ def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceDa
     return best
 
 
-@compiled_uncounted
+@compiled_inner
 def shape_distance(x: float, y: float, s: int, guess: int, data: WorkspaceData) -> tuple[float, float, float, int]:
     """Return the signed distance of a point in the plane from a shape, its gradient (2), and the block that is nearest.
 
@@ -673,7 +679,7 @@ def _from_polygon(
     return outside if outside > TOLERANCE else _deepest(ax, ay, bx, by, polygon, data)
 
 
-@compiled_uncounted
+@compiled_inner
 def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, data: WorkspaceData) -> float:
     """Return the least signed distance of a node and the half segments beside it from one shape or the wall [m].
 

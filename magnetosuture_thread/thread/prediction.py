@@ -15,11 +15,11 @@ from magnetosuture_thread.geometry.arrays import as_numbers
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.mechanics import ThreadForces
 
 MAX_COORDINATE = 1.0  # m; nothing that a dish could hold is farther away
-TIME, DEVIATION = Quantity("", "s"), Quantity("", minimum=0.0)
+TIME = Quantity("", "s")
 STARTED = "started"  # status of a prediction that no step led to
 
 

@@ -18,19 +18,18 @@ from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_checks import find_collision
 from magnetosuture_thread.settings.arguments import bounded, checked_arguments
 from magnetosuture_thread.settings.configuration import Quantity
-from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
+from magnetosuture_thread.thread.barriers import SelfContact
 from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene
+from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
-from magnetosuture_thread.thread.program import SOLVED, Indices, Solver
+from magnetosuture_thread.thread.program import SOLVED, Indices
 from magnetosuture_thread.thread.rod import RodFormulation
-from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import make_solver
 from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState, WarmStart
 
-DISH_MARGIN = 0.02  # m; a long needle that reaches over the wall, and what a camera sees above it
 LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
 START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
@@ -39,28 +38,6 @@ MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
 
 FORMULATIONS = (RodFormulation.name, PaperFormulation.name)
-
-
-def make_formulation(
-    name: str,
-    thread: Thread,
-    workspace: Workspace,
-    solver: Solver,
-    tolerance: float,
-    paper: PaperOptions | None = None,
-    barriers: Sequence[Barrier] = (),
-) -> Formulation:
-    """Return a formulation by name; the options are those of `paper`.
-
-    Raises:
-        ConfigurationError: there is no formulation of this name, or barriers cannot be told apart.
-    """
-    check_barriers(tuple(barriers))
-    if name == PaperFormulation.name:
-        return PaperFormulation(thread, workspace, solver, tolerance, paper, barriers)
-    if name != RodFormulation.name:
-        raise ConfigurationError("formulation", name, f"one of {', '.join(FORMULATIONS)}")
-    return RodFormulation(thread, workspace, solver, tolerance, barriers)
 
 
 @checked_arguments("thread predictor")
@@ -146,26 +123,25 @@ class ThreadPredictor:
             check_scene(thread, scene)
             # Margins are of the thread's surface, and of the half segments beside a node.
             reach = chosen.margin_range + 0.5 * (thread.diameter + thread.segment_length)
-            workspace = Workspace(
-                scene.obstacles,
-                reach,
-                wall_radius=scene.dish.radius,
-                friction=scene.friction,
-                wall_friction=scene.dish.wall_friction,
-            )
+            friction = scene.friction, scene.dish.wall_friction
+            workspace = Workspace(scene.obstacles, reach, 2, scene.dish.radius, *friction)
             self.scene_version = scene.version
             if formulation == RodFormulation.name and scene.dish.has_self_contact(thread.diameter):
                 barriers = (*barriers, SelfContact(thread))
         if isinstance(formulation, str):
+            Quantity("", choices=FORMULATIONS).checked("formulation", formulation, str)
+            check_barriers(tuple(barriers))
             tolerance = chosen.residual_tolerance
-            solves = make_solver(solver, tolerance)
-            formulation = make_formulation(formulation, thread, workspace, solves, tolerance, paper, barriers)
+            parts = thread, workspace, make_solver(solver, tolerance), tolerance
+            is_rod = formulation == RodFormulation.name
+            formulation = RodFormulation(*parts, barriers) if is_rod else PaperFormulation(*parts, paper, barriers)
         self.thread, self.formulation, self.contact_tolerance = thread, formulation, chosen.contact_tolerance
         self.added = formulation.added
         self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
         self._nodes = np.array([0, *self.fixed_nodes], np.int64)
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
-        self.reach = min(workspace.wall_radius + DISH_MARGIN, MAX_COORDINATE)
+        # A long needle reaches over the wall by up to 2 cm, and a camera sees what is above it.
+        self.reach = min(workspace.wall_radius + 0.02, MAX_COORDINATE)
         far, self._shape = self.reach + thread.length, (None, formulation.dimension)
         self._limits = bounded("m", -far, far)
         self.pose: NeedlePose | None = None
@@ -201,13 +177,9 @@ class ThreadPredictor:
         """
         Quantity("", choices=tuple(MATERIALS)).checked("material", material, str)
         Quantity("", choices=tuple(kind.value for kind in Attachment)).checked("attachment", attachment, str)
-        thread = Thread.of(
-            MATERIALS[material],
-            length=length,
-            segments=segments,
-            attachment=Attachment(attachment),
-            viscosity=viscosity,
-        )
+        kind = Attachment(attachment)
+        of = MATERIALS[material]
+        thread = Thread.of(of, length=length, segments=segments, attachment=kind, viscosity=viscosity)
         return cls(thread, scene, barriers, **options)
 
     @property

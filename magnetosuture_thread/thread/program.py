@@ -14,12 +14,13 @@ with d coordinates a node, all is one band of half-width 3 d.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 
@@ -188,17 +189,10 @@ class RodBuffers(NamedTuple):
         """Return buffers for a rod with these programs."""
         nodes, dimension = program.linear.shape
         places = (2, nodes, GRIPS)
-        return cls(
-            program,
-            GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1)),
-            np.zeros((6, nodes, dimension)),
-            np.zeros((nodes, dimension, dimension)),
-            np.zeros((nodes, dimension)),
-            np.zeros((4, nodes, dimension)),
-            np.zeros(dimension),
-            np.zeros((5, nodes - 1)),
-            np.zeros(3),
-        )
+        grips = GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1))
+        shapes = (6, nodes, dimension), (nodes, dimension, dimension), (nodes, dimension)
+        of_end = (4, nodes, dimension), (dimension,), (5, nodes - 1), (3,)
+        return cls(program, grips, *map(np.zeros, (*shapes, *of_end)))
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
@@ -225,9 +219,8 @@ def first_rows(buffers: StepBuffers, rows: int) -> ChainProgram:
     )
 
 
-program_of = compiled(first_rows)
 program_view = compiled_inline(first_rows)
-"""The same for kernels, and for those that do not count references to arrays."""
+"""The same for kernels."""
 
 
 class Residuals(NamedTuple):
@@ -293,7 +286,7 @@ def residuals_of(program: ChainProgram, velocities: Points, multipliers: Vector)
     others; the balance of forces by max(1, its largest force); the complementarity by
     max(1, the largest multiplier).
     """
-    return Residuals(*compiled_residuals(program, velocities, multipliers))
+    return Residuals(*residuals_with(program, velocities, multipliers, np.empty((2, *velocities.shape))))
 
 
 @compiled_inline
@@ -309,27 +302,27 @@ def _pull(program: ChainProgram, r: int, velocities: Points, multiplier: float, 
     return image
 
 
-@compiled
-def compiled_residuals(program: ChainProgram, velocities: Points, multipliers: Vector) -> tuple[float, float, float]:
-    """Return the same, for compiled code: primal, dual, complementarity.
+@compiled_inline
+def _missed(miss: float, push: float, limit: float, scale: float) -> float:
+    """Return what a row with a limit that misses a bound, or does not, adds to the complementarity."""
+    return (limit - push if miss > 0.0 else max(push, 0.0)) * min(abs(miss) / scale, 1.0)
+
+
+@compiled_uncounted
+def residuals_with(
+    program: ChainProgram, velocities: Points, multipliers: Vector, work: Table
+) -> tuple[float, float, float]:
+    """Return the same, for compiled code: primal, dual, complementarity, with memory of shape (2, m, d).
 
     Shares nothing with a solver, so P u is written out here once more.
     """
-    return _residuals(program, velocities, multipliers, np.empty(velocities.shape), np.zeros(velocities.shape))
-
-
-@compiled_inner
-def _residuals(
-    program: ChainProgram, velocities: Points, multipliers: Vector, force: Points, pulled: Points
-) -> tuple[float, float, float]:
-    """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
     nodes, dimension = velocities.shape
     blocks, couplings, linear, known = program.blocks, program.couplings, program.linear, program.known
-    compliance, limit = program.compliance, program.limit
+    compliance, limits, force, pulled = program.compliance, program.limit, work[0], work[1]
     largest = 1.0
     for i in range(nodes):
         for k in range(dimension):
-            value = 0.0
+            value = pulled[i, k] = 0.0
             for j in range(dimension):
                 value += blocks[i, k, j] * velocities[i, j]
             for apart in range(1, SPAN + 1):
@@ -339,36 +332,31 @@ def _residuals(
                     value += couplings[apart - 1, i] * velocities[i + apart, k]
             largest = max(largest, abs(value), abs(linear[i, k]))
             force[i, k] = value + linear[i, k]
-    primal, complementarity, pushed, outside = 0.0, 0.0, 1.0, 0.0
-    finite = True
+    primal, complementarity, pushed, outside, finite = 0.0, 0.0, 1.0, 0.0, True
     for r in range(len(program.lower)):
-        multiplier, scale = multipliers[r], 1.0
-        image = _pull(program, r, velocities, multiplier, pulled)
-        image += compliance[r] * multiplier
-        scale = max(scale, abs(image))
-        lower, upper = program.lower[r], program.upper[r]
-        if np.isfinite(lower):
-            scale = max(scale, abs(lower))
-        if np.isfinite(upper):
-            scale = max(scale, abs(upper))
-        gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
-        if limit[r] < np.inf:
-            outside = max(outside, abs(multiplier) - limit[r])
-            for miss, push in ((lower - image, multiplier), (image - upper, -multiplier)):
-                weight = limit[r] - push if miss > 0.0 else max(push, 0.0)
-                complementarity = max(complementarity, weight * min(abs(miss) / scale, 1.0))
-            gap = 0.0
+        multiplier, lower, upper, limit = multipliers[r], program.lower[r], program.upper[r], limits[r]
+        image = _pull(program, r, velocities, multiplier, pulled) + compliance[r] * multiplier
+        scale = max(1.0, abs(image))
+        scale = max(scale, abs(lower)) if abs(lower) < np.inf else scale
+        scale = max(scale, abs(upper)) if abs(upper) < np.inf else scale
+        if limit < np.inf:
+            outside = max(outside, abs(multiplier) - limit)
+            missed = max(
+                _missed(lower - image, multiplier, limit, scale), _missed(image - upper, -multiplier, limit, scale)
+            )
+            complementarity = max(complementarity, missed)
         else:
             primal = max(primal, (lower - image) / scale, (image - upper) / scale)
-        # A push on a bound that does not exist counts as one from a whole scale away.
-        complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
+            # A push on a bound that does not exist counts as one from a whole scale away.
+            gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
+            complementarity = max(complementarity, abs(multiplier) * min(gap / scale, 1.0))
         pushed = max(pushed, abs(multiplier))
-        finite = finite and np.isfinite(image) and np.isfinite(multiplier)
-        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(limit[r]))
+        finite = finite and abs(image) < np.inf and abs(multiplier) < np.inf
+        finite = finite and not (math.isnan(lower) or math.isnan(upper) or math.isnan(limit))
     dual = 0.0
     for i in range(nodes):
         for k in range(dimension):
-            finite = finite and np.isfinite(force[i, k])
+            finite = finite and abs(force[i, k]) < np.inf
             if not known[i]:
                 largest = max(largest, abs(pulled[i, k]))
                 dual = max(dual, abs(force[i, k] - pulled[i, k]))

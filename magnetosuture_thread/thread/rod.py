@@ -48,7 +48,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread import banded, mechanics
-from magnetosuture_thread.thread.barriers import distance_row, link_margins, move_inside
+from magnetosuture_thread.thread.barriers import SelfContact, distance_row, link_margins, move_inside
 from magnetosuture_thread.thread.contact_rows import (
     DEPTH_TOLERANCE,
     contact_rows,
@@ -58,10 +58,15 @@ from magnetosuture_thread.thread.contact_rows import (
     knows_friction,
     stays_clear,
 )
-from magnetosuture_thread.thread.forces import ThreadForces, friction_of, keep_internal_forces, write_forces
 from magnetosuture_thread.thread.margins import BarrierMargins, constant_column
 from magnetosuture_thread.thread.material import Attachment, Thread
-from magnetosuture_thread.thread.mechanics import RodProperties
+from magnetosuture_thread.thread.mechanics import (
+    RodProperties,
+    ThreadForces,
+    friction_of,
+    keep_internal_forces,
+    write_forces,
+)
 from magnetosuture_thread.thread.program import (
     ABOUT,
     BEFORE,
@@ -72,6 +77,7 @@ from magnetosuture_thread.thread.program import (
     LAST_ABOUT,
     NO_SHAPE,
     SOLVED,
+    SPAN,
     START,
     VELOCITIES,
     Indices,
@@ -82,11 +88,10 @@ from magnetosuture_thread.thread.program import (
     StepBuffers,
     Table,
     Vector,
-    compiled_residuals,
     first_rows,
     program_view,
+    residuals_with,
 )
-from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.thread.step import (
     AddedRows,
@@ -98,9 +103,6 @@ from magnetosuture_thread.thread.step import (
 )
 
 STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
-COMPLIANCE = 1e-7  # of a segment
-FRICTION_TOLERANCE = 0.003  # of the limits of friction; beyond it they are taken from the solve and it is repeated
-MAX_FRICTION_SOLVES = 5  # of a step; then the limits are those of the solve before
 MAX_SOLVES = 8  # of a step
 MAX_STEP_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
 ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
@@ -314,7 +316,8 @@ def _write_rows(
     if contacts > 0 and rough:
         rubbing, change = friction_rows(buffers, segments, contacts, workspace.friction, interval)
         contacts = contacts + rubbing if rubbing >= 0 else -1
-        rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
+        # Beyond a share of the limits they are taken from the solve, and it is repeated, up to five times.
+        rubs = change > 0.003 and 0 < solves < 5
     return contacts, max(off, depth / DEPTH_TOLERANCE) if solves > 0 else np.inf, rubs
 
 
@@ -327,22 +330,29 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, interval: f
     with the chord D_i of each segment.
     """
     nodes, dimension = about.shape
-    known, strain = buffers.known, 0.0
+    # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
+    gradient, lower, upper, known, chords = (
+        buffers.gradient,
+        buffers.lower,
+        buffers.upper,
+        buffers.known,
+        buffers.chords,
+    )
+    first, compliance, multipliers, strain = buffers.first, buffers.compliance, buffers.multipliers, 0.0
     for i in range(nodes - 1):
         begin, moved = min(i, nodes - 3), 0.0
-        shift = i - begin
-        value, _ = distance_row(about, i, i + 1, buffers.chords[i])
+        value, _ = distance_row(about, i, i + 1, chords[i])
         for a in range(dimension):
-            buffers.gradient[i, 0, a] = buffers.gradient[i, 1, a] = buffers.gradient[i, 2, a] = 0.0
             along = about[i + 1, a] - about[i, a]
-            buffers.gradient[i, shift, a], buffers.gradient[i, shift + 1, a] = along, -along
+            for k in range(SPAN):
+                gradient[i, k, a] = along if begin + k == i else (-along if begin + k == i + 1 else 0.0)
             moved += along * (start[i, a] - about[i, a] - start[i + 1, a] + about[i + 1, a])
-        buffers.first[i] = begin
-        buffers.lower[i] = buffers.upper[i] = (-value - moved) / interval
-        buffers.compliance[i] = COMPLIANCE
+        bound = (-value - moved) / interval
+        # A compliance as small as that of a contact, below what can be measured.
+        first[i], compliance[i], lower[i], upper[i] = begin, 1e-7, bound, bound
         if known[i] and known[i + 1]:
             # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
-            buffers.lower[i], buffers.upper[i], buffers.multipliers[i] = -np.inf, np.inf, 0.0
+            lower[i], upper[i], multipliers[i] = -np.inf, np.inf, 0.0
         else:
             strain = max(strain, abs(value))
     return strain
@@ -361,9 +371,11 @@ def _write_objective(rod: RodProperties, buffers: RodBuffers, step_input: StepIn
     before, start, last, about = motion[BEFORE], motion[START], motion[LAST], motion[ABOUT]
     nodes, dimension = start.shape
     blocks, couplings, linear = program.blocks, program.couplings, program.linear
+    drag, drag_linear, weights, bands = buffers.drag, buffers.drag_linear, rod.weights, rod.bands
+    gravity, flow, unit, damping = rod.gravity, rod.flow, rod.unit, rod.bending_damping
     inertia = rod.mass_per_length / interval
     scale = inertia + rod.drag_across
-    rate = rod.bending_stiffness / (scale * rod.unit**4)
+    rate = rod.bending_stiffness / (scale * unit**4)
     inertia = inertia / scale
     mechanics.metric(about, rod.weights, inertia, rod.drag_across / scale, rod.drag_along / scale, blocks)
     mechanics.bending_gradient(start, heading, rod.clamped, rod.rest_angles, program.work, linear)
@@ -371,30 +383,30 @@ def _write_objective(rod: RodProperties, buffers: RodBuffers, step_input: StepIn
     if inertia > 0.0 or ratio > MAX_STEP_RATIO:
         ratio = 0.0
     leading, trailing = (1.0 + 2.0 * ratio) / (1.0 + ratio), ratio / (1.0 + ratio)
-    stiffness = rate * (interval + rod.bending_damping)
+    stiffness = rate * (interval + damping)
     for i in range(nodes):
         for a in range(dimension):
             bending = value = rate * linear[i, a]
             for b in range(dimension):
                 value -= trailing * blocks[i, a, b] * last[i, b]
-            value -= inertia * rod.weights[i] * (last[i, a] + interval / rod.unit * rod.gravity[a])
+            value -= inertia * weights[i] * (last[i, a] + interval / unit * gravity[a])
             for b in range(dimension):
-                value -= blocks[i, a, b] * rod.flow[b] / rod.unit
-            linear[i, a] = value + inertia * rod.weights[i] * rod.flow[a] / rod.unit
-            buffers.drag_linear[i, a] = linear[i, a] - bending
+                value -= blocks[i, a, b] * flow[b] / unit
+            linear[i, a] = value + inertia * weights[i] * flow[a] / unit
+            drag_linear[i, a] = linear[i, a] - bending
         for a in range(dimension):
             for b in range(dimension):
                 blocks[i, a, b] *= leading
-                buffers.drag[i, a, b] = blocks[i, a, b]
-            blocks[i, a, a] += stiffness * rod.bands[0, i]
+                drag[i, a, b] = blocks[i, a, b]
+            blocks[i, a, a] += stiffness * bands[0, i]
         for apart in range(1, 4):
-            couplings[apart - 1, i] = stiffness * rod.bands[apart, i]
-    if rod.bending_damping > 0.0:
-        weight = rate * rod.bending_damping / interval
+            couplings[apart - 1, i] = stiffness * bands[apart, i]
+    if damping > 0.0:
+        weight = rate * damping / interval
         for i in range(nodes):
             for apart in range(-3, 4):
                 if 0 <= i + apart < nodes:
-                    band = weight * rod.bands[abs(apart), min(i, i + apart)]
+                    band = weight * bands[abs(apart), min(i, i + apart)]
                     for a in range(dimension):
                         linear[i, a] += band * (start[i + apart, a] - before[i + apart, a])
     mechanics.tension_stiffness(
@@ -413,16 +425,17 @@ def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -
     that is pulled hard, T dt > Z, swing from side to side and never end.
     """
     nodes, dimension = about.shape
+    linear, blocks, couplings, multipliers = buffers.linear, buffers.blocks, buffers.couplings, buffers.multipliers
     for i in range(nodes - 1):
-        tension = max(buffers.multipliers[i], 0.0)
+        tension = max(multipliers[i], 0.0)
         weight = interval * tension
         for a in range(dimension):
             moved = about[i + 1, a] - start[i + 1, a] - about[i, a] + start[i, a]
-            buffers.linear[i, a] += tension * moved
-            buffers.linear[i + 1, a] -= tension * moved
-            buffers.blocks[i, a, a] += weight
-            buffers.blocks[i + 1, a, a] += weight
-        buffers.couplings[0, i] -= weight
+            linear[i, a] += tension * moved
+            linear[i + 1, a] -= tension * moved
+            blocks[i, a, a] += weight
+            blocks[i + 1, a, a] += weight
+        couplings[0, i] -= weight
 
 
 @compiled_within
@@ -436,7 +449,7 @@ def _solve(buffers: RodBuffers, solver_buffers: banded.SolverBuffers, rows: int,
     multipliers, worst = buffers.program.multipliers[:rows], buffers.residuals
     for attempt in range(2):
         word, _ = banded.solve(program, u, multipliers, solver_buffers)
-        residuals = compiled_residuals(program, u, multipliers)
+        residuals = residuals_with(program, u, multipliers, buffers.program.work)
         if max(residuals) <= tolerance:
             for k in range(3):
                 worst[k] = max(worst[k], residuals[k])
@@ -495,19 +508,15 @@ class RodFormulation(Formulation):
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
         self.buffers = RodBuffers.of(self._program)
         medium = thread.medium
+        clamped, drag = thread.attachment is Attachment.CLAMPED, (medium.drag_across, medium.drag_along)
+        sizes = thread.segment_length, self._radius, thread.bending_stiffness, *drag
         self.rod = RodProperties(
-            thread.attachment is Attachment.CLAMPED,
-            float(thread.segment_length),
-            float(self._radius),
-            float(thread.bending_stiffness),
-            float(medium.drag_across),
-            float(medium.drag_along),
-            float(medium.mass_per_length),
-            float(medium.bending_damping),
+            clamped,
+            *map(float, (*sizes, medium.mass_per_length, medium.bending_damping)),
             self._vector("gravity", medium.gravity),
             np.ascontiguousarray(thread.rest_angles),
             mechanics.end_corrected_weights(thread.segments),
-            mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED),
+            mechanics.bending_bands(thread.segments, clamped),
             self._vector("flow", medium.flow),
         )
         first = solver.first if type(solver) is FallbackSolver else solver

@@ -17,9 +17,10 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.barriers import SolidRows, solid_rows
-from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE
 from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
+from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.program import (
     ChainProgram,
     Indices,
@@ -33,9 +34,6 @@ from magnetosuture_thread.thread.program import (
     first_rows,
     residuals_of,
 )
-
-DISTANCE_TOLERANCE = 1e-7  # m; an added row that is met but for this much of its nodes' way holds
-UNMET_COMPLIANCE = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
 
 
 @dataclass(frozen=True)
@@ -249,15 +247,16 @@ class AddedBarriers:
             moved = np.einsum("rkd,rkd->r", gradient, (start - about)[nodes])
             lower = (missing / self._unit - moved) / interval
             soft, most = 1.0 / barrier.slack_weight, float(missing.max(initial=0.0))
-            compliance = np.where(lower > 0.0, max(soft, UNMET_COMPLIANCE), soft)
-            off = most / DISTANCE_TOLERANCE if soft == 0.0 else 0.0
+            # Against a hard row that has to be met from outside something else may hold.
+            compliance = np.where(lower > 0.0, max(soft, 1e-7), soft)
+            off = most / DEPTH_TOLERANCE if soft == 0.0 else 0.0
             unmet = off > 1.0 if soft == 0.0 else most > 0.0
             found.append(AddedRows(nodes, gradient, lower, compliance, unmet, off))
         width = max(rows.nodes.shape[1] for rows in found)
-        wide = [width - rows.nodes.shape[1] for rows in found]
+        wide = [(rows, width - rows.nodes.shape[1]) for rows in found]
         return AddedRows(
-            np.concatenate([np.pad(r.nodes, ((0, 0), (0, w)), mode="edge") for r, w in zip(found, wide, strict=True)]),
-            np.concatenate([np.pad(r.gradient, ((0, 0), (0, w), (0, 0))) for r, w in zip(found, wide, strict=True)]),
+            np.concatenate([np.pad(rows.nodes, ((0, 0), (0, more)), mode="edge") for rows, more in wide]),
+            np.concatenate([np.pad(rows.gradient, ((0, 0), (0, more), (0, 0))) for rows, more in wide]),
             np.concatenate([rows.lower for rows in found]),
             np.concatenate([rows.compliance for rows in found]),
             any(rows.unmet for rows in found),

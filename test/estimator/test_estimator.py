@@ -235,7 +235,7 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     """A straight thread has no constraint across it, so that across it the update is the plain one."""
     rng, straight = np.random.default_rng(4), np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
     place, ones = np.sort(rng.uniform(0.2, NODES - 1.0, 40)), np.ones(40)
-    points = MeasuredPoints(place, rng.normal(0.0, 5e-5, 40), 1e-4 * ones, ones, ones)
+    points = MeasuredPoints(place, rng.normal(0.0, 5e-5, 40), 1e-4 * ones, ones, ones, ones.copy())
     predictor = predictor_of(thread_of(NODES - 1))
     assert isinstance(predictor.formulation, RodFormulation)
     corrector = Corrector(predictor, predictor.formulation)
