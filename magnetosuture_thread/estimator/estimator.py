@@ -415,11 +415,10 @@ class ThreadEstimator:
             margins, bounds = formulation.margins(positions, pose.heading), dict[str, Vector]()
             for solid in margins:
                 if solid.barrier in SOLID:
-                    rows = solid.node[:, None], solid.normal[:, None], solid.clearance
-                    bounds[solid.barrier] = clearance_bound(*rows, covariance, neighbours=True)
-            for barrier in added:
-                rows = barrier.nodes, barrier.gradient, barrier.clearance
-                bounds[barrier.name] = clearance_bound(*rows, covariance)
+                    nodes, gradient = solid.node[:, None], solid.normal[:, None]
+                    bounds[solid.barrier] = clearance_bound(nodes, gradient, solid.clearance, covariance, True)
+            for rows in added:
+                bounds[rows.name] = clearance_bound(rows.nodes, rows.gradient, rows.clearance, covariance)
             margins += map(BarrierMargins.from_rows, added)
             return Margins.of(margins, tolerance, prediction.scene_version).with_bounds(bounds)
 

@@ -87,7 +87,8 @@ class ForecastStart:
             tip_velocity: see the attributes.
         """
         forces = estimate.prediction.forces
-        return cls(pose, estimate.positions, None, 0.0, tip_velocity, None, forces and forces.needle_force)
+        needle_force = None if forces is None else forces.needle_force
+        return cls(pose, estimate.positions, tip_velocity=tip_velocity, needle_force=needle_force)
 
     @classmethod
     def of_predictor(
@@ -504,8 +505,8 @@ class ThreadForecaster:
             done = k + 1
         instants = done + 1
         memory = self._contacts(), np.empty((nodes, 2)), np.empty((5, nodes - 1))
-        moved = self._formulation.rod, self._around, vertices[:instants], poses[:instants, 2:].copy()
-        if not least_margins(*moved, *memory, margin, margin_nodes, margin_shapes):
+        walked = self._formulation.rod, self._around, vertices[:instants], poses[:instants, 2:].copy()
+        if not least_margins(*walked, *memory, margin, margin_nodes, margin_shapes):
             raise InvalidInputError("scene", "more contacts than there is memory for", "fewer shapes")
         return Forecast(
             stamp=start.pose.stamp,

@@ -508,17 +508,14 @@ class RodFormulation(Formulation):
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
         self.buffers = RodBuffers.of(self._program)
         medium = thread.medium
-        clamped, drag = thread.attachment is Attachment.CLAMPED, (medium.drag_across, medium.drag_along)
-        sizes = thread.segment_length, self._radius, thread.bending_stiffness, *drag
-        self.rod = RodProperties(
-            clamped,
-            *map(float, (*sizes, medium.mass_per_length, medium.bending_damping)),
-            self._vector("gravity", medium.gravity),
-            np.ascontiguousarray(thread.rest_angles),
-            mechanics.end_corrected_weights(thread.segments),
-            mechanics.bending_bands(thread.segments, clamped),
-            self._vector("flow", medium.flow),
-        )
+        clamped, sizes = thread.attachment is Attachment.CLAMPED, (float(thread.segment_length), float(self._radius))
+        drag = float(medium.drag_across), float(medium.drag_along)
+        air = float(medium.mass_per_length), float(medium.bending_damping)
+        weights = mechanics.end_corrected_weights(thread.segments)
+        bands = mechanics.bending_bands(thread.segments, clamped)
+        gravity, flow = self._vector("gravity", medium.gravity), self._vector("flow", medium.flow)
+        rest, bending = np.ascontiguousarray(thread.rest_angles), float(thread.bending_stiffness)
+        self.rod = RodProperties(clamped, *sizes, bending, *drag, *air, gravity, rest, weights, bands, flow)
         first = solver.first if type(solver) is FallbackSolver else solver
         structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
