@@ -358,7 +358,7 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, interval: f
     return strain
 
 
-@compiled_within
+@compiled_inner
 def _write_objective(rod: RodProperties, buffers: RodBuffers, step_input: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
@@ -459,7 +459,7 @@ def _solve(buffers: RodBuffers, solver_buffers: banded.SolverBuffers, rows: int,
     return banded.STALLED
 
 
-@compiled_within
+@compiled_inner
 def _accept(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -> None:
     """Accept the velocities and multipliers in the buffers as the solution of the first rows: keep what follows."""
     start, velocities, about = buffers.motion[START], buffers.motion[VELOCITIES], buffers.motion[ABOUT]
