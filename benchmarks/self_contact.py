@@ -17,9 +17,9 @@ from magnetosuture_thread import NeedlePose, SolverError, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.thread.barriers import SelfContact
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 from magnetosuture_thread.thread.rod import RodFormulation
-from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import make_solver
 from magnetosuture_thread.thread.step import PrescribedMotion, StepResult, ThreadState
 

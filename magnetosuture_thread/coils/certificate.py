@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inner
 from magnetosuture_thread.geometry.obstacles import EDGE_WIDTH, WorkspaceData, measure
 from magnetosuture_thread.geometry.polyline import Points
 
@@ -125,7 +125,7 @@ def pose_needle(data: FilterData, x: float, y: float, heading_x: float, heading_
     return PosedNeedle(data, points, turning, chord_x, chord_y, distances, normal)
 
 
-@compiled
+@compiled_inner
 def crossings(square: float, linear: float, constant: float, omega: float) -> tuple[float, float]:
     """Return the times of both roots of  square m^2 + linear m + constant = 0  within a turn, rising; inf for none.
 
@@ -154,7 +154,7 @@ def crossings(square: float, linear: float, constant: float, omega: float) -> tu
     return (first, second) if first <= second else (second, first)
 
 
-@compiled
+@compiled_inner
 def circle_exit(
     qx: float, qy: float, gap: float, radius: float, vx: float, vy: float, omega: float, outside: bool
 ) -> float:
@@ -180,7 +180,7 @@ def circle_exit(
     return crossings(-square + 0.25 * omega * omega * c, -2.0 * a, c, omega)[0]
 
 
-@compiled
+@compiled_inner
 def _disc_time(qx: float, qy: float, base: float, keep: float, vx: float, vy: float, omega: float) -> float:
     """Return when a point gets nearer to a disc of radius `base` than `keep`, or than it is if that is nearer [s]."""
     away = math.hypot(qx, qy)
@@ -190,7 +190,7 @@ def _disc_time(qx: float, qy: float, base: float, keep: float, vx: float, vy: fl
     return circle_exit(qx, qy, away - radius, radius, vx, vy, omega, True)
 
 
-@compiled
+@compiled_inner
 def _strip_time(
     qx: float, qy: float, dx: float, dy: float, length: float, floor: float, vx: float, vy: float, omega: float
 ) -> float:
@@ -223,7 +223,7 @@ def _strip_time(
     return t if -slack <= along <= length + slack else np.inf
 
 
-@compiled
+@compiled_inner
 def _polygon_time(needle: PosedNeedle, i: int, s: int, vx: float, vy: float, omega: float, limit: float) -> float:
     """Return when a point gets nearer to a polygon than `keep`, or than it is if that is nearer; `limit` for later [s].
 
@@ -365,8 +365,12 @@ def is_clear_turned(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.
         x = needle.points[0, 0] + lever * (chord_x - ex)
         y = needle.points[0, 1] + lever * (chord_y - ey)
         turned = pose_needle(wider, x, y, body.chord_x * ex + body.chord_y * ey, body.chord_x * ey - body.chord_y * ex)
-        if (turned.distances < keep).any() or (np.hypot(turned.points[:, 0], turned.points[:, 1]) > most).any():
-            return False
+        for i in range(len(turned.points)):
+            if math.hypot(turned.points[i, 0], turned.points[i, 1]) > most:
+                return False
+            for s in range(turned.distances.shape[1]):
+                if turned.distances[i, s] < keep:
+                    return False
         wx, wy = along * ex - drift * ey, along * ey + drift * ex
         if safe_time(wx, wy, turned, drift)[1] != NOTHING:
             return False

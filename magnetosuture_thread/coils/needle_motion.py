@@ -21,7 +21,7 @@ from magnetosuture_thread.coils.certificate import (
     is_clear_turned,
     safe_time,
 )
-from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inner
 from magnetosuture_thread.geometry.needle_arc import needle_chord
 from magnetosuture_thread.geometry.obstacles import ContactRows, polygon_rows, shape_distance
 from magnetosuture_thread.geometry.polyline import Points
@@ -232,7 +232,7 @@ class Rows(NamedTuple):
     shape: NDArray[np.int64]
 
 
-@compiled
+@compiled_inner
 def find_rows(needle: PosedNeedle, reach: float, rows: Rows) -> int:
     """Write a row for every local minimum of a point's distance to the wall or a shape within reach [m].
 
@@ -354,7 +354,7 @@ def _projected(
     return True, shorter * found[0], shorter * found[1]
 
 
-@compiled
+@compiled_inner
 def _tangent(x: float, y: float, what: int, needle: PosedNeedle) -> tuple[float, float, float]:
     """Return the way out (2) at a point that meets the wall or a shape, and its margin there [m]."""
     data, scene = needle.data, needle.data.scene
@@ -368,7 +368,7 @@ def _tangent(x: float, y: float, what: int, needle: PosedNeedle) -> tuple[float,
     return gx, gy, distance - data.keep
 
 
-@compiled
+@compiled_inner
 def _is_clear(
     vx: float, vy: float, needle: PosedNeedle, rows: NDArray[np.float64], least: NDArray[np.float64], count: int
 ) -> bool:
@@ -376,15 +376,16 @@ def _is_clear(
 
     In the first `count` rows, of wall and shapes, a motion of the second kind has as much less of its turn.
     """
-    data = needle.data
-    holding = rows[:, 0] * vx + rows[:, 1] * vy >= least
-    if holding.all() and safe_time(vx, vy, needle)[0] >= data.hold:
-        return True
-    if data.turn_time >= data.hold or not holding[count:].all():
-        return False
+    data, holding, turned = needle.data, True, True
     across = (1.0 - data.turn_time / data.hold) * (-vx * needle.chord_y + vy * needle.chord_x)
     x, y = vx + across * needle.chord_y, vy - across * needle.chord_x
-    return bool((rows[:count, 0] * x + rows[:count, 1] * y >= least[:count]).all()) and is_clear_turned(vx, vy, needle)
+    for k in range(len(least)):
+        holds = rows[k, 0] * vx + rows[k, 1] * vy >= least[k]
+        holding = holding and holds
+        turned = turned and (rows[k, 0] * x + rows[k, 1] * y >= least[k] if k < count else holds)
+    if holding and safe_time(vx, vy, needle, 0.0)[0] >= data.hold:
+        return True
+    return data.turn_time < data.hold and turned and is_clear_turned(vx, vy, needle, 0.0)
 
 
 @compiled
@@ -429,7 +430,7 @@ def nearest_clear(
     depth[count:fixed], who[count:fixed] = -added.margin, added.barrier
     if not (depth[:fixed] > 0.0).any() and _is_clear(vx, vy, needle, rows[:fixed], least[:fixed], count):
         return vx, vy
-    what = safe_time(vx, vy, needle)[1]
+    what = safe_time(vx, vy, needle, 0.0)[1]
     bounded = least.copy()
     best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
     ux, uy, total = vx, vy, fixed
@@ -443,7 +444,7 @@ def nearest_clear(
                 break
         if not holds:
             break
-        time, ended, where = safe_time(x, y, needle)
+        time, ended, where = safe_time(x, y, needle, 0.0)
         share = 1.0 if time >= hold else SURE * time / hold
         off = (share * x - vx) ** 2 + (share * y - vy) ** 2
         if off < best:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from magnetosuture_thread.estimator.disturbance import Disturbance
-from magnetosuture_thread.estimator.estimator import EstimatorOptions, ThreadEstimate, ThreadEstimator
-from magnetosuture_thread.estimator.session import EstimatorSession
+from magnetosuture_thread.estimator.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 
 __all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"]

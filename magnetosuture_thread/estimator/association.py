@@ -52,7 +52,7 @@ def path_without_outliers(points: Points, spacing: float, penalty: float) -> NDA
         cost[i], before[i] = penalty * i, -1
         # At most 8 points in a row are outliers.
         for j in range(max(0, i - 8), i):
-            step = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
+            step = math.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
             value = cost[j] + max(step - 2.0 * spacing * (i - j), 0.0) + penalty * (i - j - 1)
             if value <= cost[i]:
                 cost[i], before[i] = value, j
@@ -78,12 +78,12 @@ def path_lengths(points: Points, spacing: float) -> Vector:
     count, last = len(points), 0
     arcs = np.zeros(count)
     for p in range(1, count):
-        step = np.hypot(points[p, 0] - points[last, 0], points[p, 1] - points[last, 1])
+        step = math.hypot(points[p, 0] - points[last, 0], points[p, 1] - points[last, 1])
         if step < spacing and p < count - 1:
             continue
         total = 0.0
         for k in range(last + 1, p + 1):
-            arcs[k] = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+            arcs[k] = math.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
             total += arcs[k]
         for k in range(last + 1, p + 1):
             arcs[k] = arcs[k - 1] + (step * arcs[k] / total if total > 0.0 else 0.0)
@@ -200,7 +200,7 @@ def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: fl
                 place[p] = i + inside
         t = place[p] - found
         ex, ey = nodes[found + 1, 0] - nodes[found, 0], nodes[found + 1, 1] - nodes[found, 1]
-        size = np.hypot(ex, ey)
+        size = math.hypot(ex, ey)
         mx, my = -ey / size, ex / size
         value = mx * (points[p, 0] - nodes[found, 0]) + my * (points[p, 1] - nodes[found, 1])
         for k in range(found, found + 2):
@@ -324,6 +324,7 @@ class MeasuredPoints(NamedTuple):
         variance: of each point across the thread, shape (m,) [D^2].
         share: part of its information that is its own, shape (m,).
         weight: robust weight of each, at most 1, shape (m,); rewritten by each use.
+        residual: memory of a correction, shape (m,).
         end: innovation of the free end along the thread and the variance of it, inf if it is not seen [D], [D^2].
     """
 
@@ -332,6 +333,7 @@ class MeasuredPoints(NamedTuple):
     variance: Vector
     share: Vector
     weight: Vector
+    residual: Vector
     end: tuple[float, float] = (0.0, math.inf)
 
 
@@ -368,8 +370,8 @@ def measured_points(
             deviation = LENGTH_ERROR * segments
             if abs(off) < 6.0 * (deviation + math.sqrt(end_variance)):
                 end = off, deviation**2 + float(piece.variance[-1])
-    columns = np.concatenate(found, axis=1)
+    columns = np.ascontiguousarray(np.concatenate(found, axis=1))  # compiled code takes its rows
     if not columns.size:
         return None, problems
-    place, innovation, variance, share = columns
-    return MeasuredPoints(place, innovation, variance, share, np.ones(columns.shape[1]), end), problems
+    (place, innovation, variance, share), (weight, residual) = columns, np.ones((2, columns.shape[1]))
+    return MeasuredPoints(place, innovation, variance, share, weight, residual, end), problems

@@ -20,20 +20,21 @@ viscous liquid. Deviation: [Forghani2025] has no estimate, its program runs open
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator.association import MeasuredPoints
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline
+from magnetosuture_thread.geometry.compiled import TypedKernel, compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, compiled_residuals, program_of
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, Table, program_view, residuals_with
 from magnetosuture_thread.thread.rod import STRAIN_TOLERANCE, RodFormulation, segment_rows
 from magnetosuture_thread.thread.solvers import BandedSolver
 
@@ -74,23 +75,26 @@ class CorrectionBuffers(NamedTuple):
         solver: of the structured solver, with the factors of the last matrix.
         about: where the nodes are, shape (n + 1, 2) [D].
         moved: d, shape (n + 1, 2) [D].
-        known: nodes that are no unknowns, shape (n + 1,).
         covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
+        normal_equations: of the points of each segment, shape (n, 5).
+        inverse: of the last matrix, see `selected_inverse`.
     """
 
     program: StepBuffers
     solver: banded.SolverBuffers
     about: Points
     moved: Points
-    known: NDArray[np.bool_]
-    covariance: NDArray[np.float64]
+    covariance: Table
+    normal_equations: Table
+    inverse: Table
 
     @classmethod
     def of(cls, nodes: int) -> CorrectionBuffers:
         """Return buffers for a thread of so many nodes."""
         program, (about, moved) = StepBuffers.of(nodes, 2, 3 * (nodes - 1) + 1), np.zeros((2, nodes, 2))
         solver = BandedSolver().buffers(nodes, 2, len(program.first))
-        return cls(program, solver, about, moved, np.zeros(nodes, dtype=np.bool_), np.zeros((nodes, 2, 2)))
+        tables = np.zeros((nodes, 2, 2)), np.zeros((nodes - 1, 5)), np.zeros((2 * nodes + 6, 7))
+        return cls(program, solver, about, moved, *tables)
 
 
 def normals_of(positions: Points) -> Points:
@@ -100,7 +104,7 @@ def normals_of(positions: Points) -> Points:
     return np.asarray(left / np.maximum(np.hypot(*along.T), 1e-12)[:, None])
 
 
-@compiled
+@compiled_uncounted
 def robust_weights(residual: Vector, variance: Vector, weights: Vector) -> float:
     """Write the weight of each point's error under Student's distribution; return the largest change.
 
@@ -115,17 +119,15 @@ def robust_weights(residual: Vector, variance: Vector, weights: Vector) -> float
         weights: written, at most 1.
     """
     change, count = 0.0, len(residual)
-    near = np.empty(2 * NEIGHBOURS + 1)
     for p in range(count):
         first, last = max(0, p - NEIGHBOURS), min(count, p + NEIGHBOURS + 1)
-        for k in range(first, last):  # sorted by insertion
-            at = k - first
-            while at > 0 and near[at - 1] > residual[k]:
-                near[at] = near[at - 1]
-                at -= 1
-            near[at] = residual[k]
-        off = residual[p] - near[(last - first) // 2]
-        off = off if abs(off) < abs(residual[p]) else residual[p]
+        off = residual[p]
+        for k in range(first, last):
+            below = 0
+            for j in range(first, last):
+                below += residual[j] < residual[k] or (residual[j] == residual[k] and j < k)
+            if below == (last - first) // 2 and abs(residual[p] - residual[k]) < abs(residual[p]):
+                off = residual[p] - residual[k]
         weight = min(1.0, (FREEDOM + 1.0) / (FREEDOM + off * off / variance[p]))
         change = max(change, abs(weight - weights[p]))
         weights[p] = weight
@@ -165,8 +167,8 @@ def prior_information(prior: Prior, scale: float, clamped: bool, buffers: StepBu
     buffers.blocks[:] = across + own[:, None, None] * np.eye(2)
 
 
-@compiled
-def measured_rows(points: MeasuredPoints, scale: float, about: Points, row: int, buffers: StepBuffers) -> int:
+@compiled_within
+def measured_rows(points: MeasuredPoints, scale: float, about: Points, work: CorrectionBuffers) -> int:
     """Write the points of each segment as at most two rows, with the compliance as their variance; return the end.
 
     Points p of one segment have a_p in the span of two vectors, so that sum_p w_p (a_p' d - nu_p)^2 is, up to a
@@ -177,41 +179,38 @@ def measured_rows(points: MeasuredPoints, scale: float, about: Points, row: int,
         points: the points, with their robust weights.
         scale: by which information is divided.
         about: where segments' normals are taken, shape (n + 1, 2).
-        row: the first row.
-        buffers: written from that row on.
+        work: its program is written, from the row after those of the segments on.
     """
-    segments = len(about) - 1
-    gram = np.zeros((segments, 5))
-    for p in range(len(points.place)):
-        i = min(int(points.place[p]), segments - 1)
-        t = points.place[p] - i
-        w = points.weight[p] * points.share[p] / (points.variance[p] * scale)
+    buffers, gram, segments = work.program, work.normal_equations, len(about) - 1
+    place, innovation, weights = points.place, points.innovation, points.weight
+    gram[:] = 0.0
+    for p in range(len(place)):
+        i = min(int(place[p]), segments - 1)
+        t = place[p] - i
+        w = weights[p] * points.share[p] / (points.variance[p] * scale)
         gram[i, 0] += w * (1.0 - t) * (1.0 - t)
         gram[i, 1] += w * (1.0 - t) * t
         gram[i, 2] += w * t * t
-        gram[i, 3] += w * (1.0 - t) * points.innovation[p]
-        gram[i, 4] += w * t * points.innovation[p]
-    for i in range(segments):
-        total = gram[i, 0] + gram[i, 2]
-        if total <= 0.0:
-            continue
+        gram[i, 3] += w * (1.0 - t) * innovation[p]
+        gram[i, 4] += w * t * innovation[p]
+    row, seen = segments, math.isfinite(points.end[1])
+    for k in range(2 * segments + 1):
+        i, part = min(k // 2, segments - 1), k % 2 if k < 2 * segments else 2
         ex, ey = about[i + 1, 0] - about[i, 0], about[i + 1, 1] - about[i, 1]
-        size = np.hypot(ex, ey)
-        low, value = 0.0, 0.0
-        if gram[i, 0] > 0.0:
-            root = np.sqrt(gram[i, 0])
-            low, value = gram[i, 1] / root, gram[i, 3] / root
-            _write_row(buffers, row, i, (root, low), value, (-ey / size, ex / size))
-            row += 1
+        size = math.hypot(ex, ey)
+        root = math.sqrt(gram[i, 0])
+        low, value = (gram[i, 1] / root, gram[i, 3] / root) if root > 0.0 else (0.0, 0.0)
         rest = gram[i, 2] - low * low
-        if rest > 1e-9 * total:
-            root = np.sqrt(rest)
+        if part == 0 and root > 0.0:
+            _write_row(buffers, row, i, (root, low), value, (-ey / size, ex / size))
+        elif part == 1 and rest > 1e-9 * (gram[i, 0] + gram[i, 2]):
+            root = math.sqrt(rest)
             _write_row(buffers, row, i, (0.0, root), (gram[i, 4] - low * value) / root, (-ey / size, ex / size))
-            row += 1
-    if np.isfinite(points.end[1]):
-        ex, ey = about[segments, 0] - about[segments - 1, 0], about[segments, 1] - about[segments - 1, 1]
-        size, weight = np.hypot(ex, ey), 1.0 / np.sqrt(scale * points.end[1])
-        _write_row(buffers, row, segments - 1, (0.0, weight), weight * points.end[0], (ex / size, ey / size))
+        elif part == 2 and seen:
+            weight = 1.0 / math.sqrt(scale * points.end[1])
+            _write_row(buffers, row, i, (0.0, weight), weight * points.end[0], (ex / size, ey / size))
+        else:
+            continue
         row += 1
     return row
 
@@ -226,17 +225,19 @@ def _write_row(
     direction: tuple[float, float],
 ) -> None:
     """Write a row over the two nodes of a segment: of unit length, its weight in the compliance."""
-    length, begin = np.hypot(weights[0], weights[1]), min(segment, len(buffers.linear) - 3)
-    buffers.first[row], buffers.gradient[row] = begin, 0.0
-    for k in range(2):
-        for a in range(2):
-            buffers.gradient[row, segment - begin + k, a] = weights[k] / length * direction[a]
+    length, begin = math.hypot(weights[0], weights[1]), min(segment, len(buffers.linear) - 3)
+    buffers.first[row] = begin
+    for a in range(2):
+        for k in range(3):
+            buffers.gradient[row, k, a] = 0.0
+        buffers.gradient[row, segment - begin, a] = weights[0] / length * direction[a]
+        buffers.gradient[row, segment - begin + 1, a] = weights[1] / length * direction[a]
     buffers.lower[row] = buffers.upper[row] = value / length
     buffers.compliance[row] = 1.0 / (length * length)
     buffers.multipliers[row] = 0.0
 
 
-@compiled
+@compiled_within
 def selected_inverse(width: int, unknowns: int, band: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
     """Write the entries within the band of the inverse of L D L', in time linear in its size.
 
@@ -250,7 +251,7 @@ def selected_inverse(width: int, unknowns: int, band: NDArray[np.float64], inver
 
     Source: K. Takahashi, J. Fagan, M.-S. Chen 1973.
     """
-    inverse[unknowns:] = 0.0
+    inverse[:] = 0.0
     for j in range(unknowns - 1, -1, -1):
         for a in range(width, -1, -1):
             value = band[j, 0] if a == 0 else 0.0
@@ -261,25 +262,23 @@ def selected_inverse(width: int, unknowns: int, band: NDArray[np.float64], inver
             inverse[j, a] = value
 
 
-@compiled
+@compiled_uncounted
 def correct(
     rod: RodProperties,
     workspace: WorkspaceData,
     work: CorrectionBuffers,
-    start: Points,
-    heading: Points,
+    prior: Prior,
     scale: float,
     points: MeasuredPoints,
 ) -> tuple[int, float, float]:
-    """Correct a thread by measured points.
+    """Correct a thread by measured points: linearise, check, solve and weigh the points anew, until the barriers hold.
 
     Args:
         rod: the thread.
         workspace: obstacles and wall [m].
-        work: the program holds Lambda and `known` is read; `about` gets the corrected thread, `moved` the correction,
+        work: the program holds Lambda and the known nodes; `about` gets the corrected thread, `moved` the correction,
             `covariance` what is left.
-        start: the predicted nodes, shape (n + 1, 2) [D].
-        heading: of the needle, shape (2,).
+        prior: the predicted thread.
         scale: of the program.
         points: the points, with robust weights to begin with; in the end those used.
 
@@ -287,49 +286,58 @@ def correct(
         Number of contacts, -1 where there is no room for them; the largest error of the hard constraints over what is
         allowed, at most 1 where they hold; the largest residual of the last solve.
     """
-    buffers, segments, contacts = work.program, len(start) - 1, 0
-    known, about, moved = work.known, work.about, work.moved
-    about[:], moved[:], buffers.multipliers[:], buffers.push[:] = start, 0.0, 0.0, 0.0
-    residual = np.empty(len(points.place))
-    solves, change, off, largest, row = 0, 1.0, np.inf, 0.0, segments
+    buffers, start, segments = work.program, prior.positions, len(prior.positions) - 1
+    about, moved = work.about, work.moved
+    for i in range(segments + 1):
+        for a in range(2):
+            about[i, a], moved[i, a] = start[i, a], 0.0
+    buffers.multipliers[:] = 0.0
+    buffers.push[:] = 0.0
+    solves, change, largest, row = 0, 1.0, 0.0, 0
     while True:
         if change > CHANGED:
-            row = measured_rows(points, scale, start, segments, buffers)
-        mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
-        strain = segment_rows(buffers, about, start, known, 1.0)
-        contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
+            row = measured_rows(points, scale, start, work)
+        mechanics.chord_lengths(about, prior.heading, rod.clamped, buffers.chords)
+        strain = segment_rows(buffers, about, start, 1.0)
+        contacts, depth = contact_rows(buffers, row, workspace, about, start, 1.0, rod.unit, rod.radius, True)
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         done = off <= 1.0 and change <= CHANGED and largest <= RESIDUAL_TOLERANCE
         if contacts < 0 or (solves > 0 and (done or solves >= MAX_SOLVES)):
             break
-        rows = row + contacts
-        u, multipliers = moved.copy(), buffers.multipliers[:rows].copy()
-        program = program_of(buffers, known, rows)
-        banded.solve(program, u, multipliers, work.solver)
-        solves, largest = solves + 1, max(compiled_residuals(program, u, multipliers))
+        for r in range(segments, row):
+            buffers.multipliers[r] = 0.0
+        program, multipliers = program_view(buffers, row + contacts), buffers.multipliers[: row + contacts]
+        banded.solve(program, moved, multipliers, work.solver)
+        solves, largest = solves + 1, max(residuals_with(program, moved, multipliers, buffers.work))
         if not largest < np.inf:
             break
-        moved[:], about[:] = u, start + u
-        buffers.multipliers[:segments] = multipliers[:segments]
-        change = 0.0
+        for i in range(segments + 1):
+            for a in range(2):
+                about[i, a] = start[i, a] + moved[i, a]
         # Three solutions get new robust weights.
-        if solves < 3:
-            for p in range(len(residual)):
-                i = min(int(points.place[p]), segments - 1)
-                t = points.place[p] - i
-                ex, ey = start[i + 1, 0] - start[i, 0], start[i + 1, 1] - start[i, 1]
-                dx, dy = (1.0 - t) * u[i, 0] + t * u[i + 1, 0], (1.0 - t) * u[i, 1] + t * u[i + 1, 1]
-                residual[p] = points.innovation[p] - (ex * dy - ey * dx) / np.hypot(ex, ey)
-            change = robust_weights(residual, points.variance, points.weight)
+        change = _weigh(points, start, moved) if solves < 3 else 0.0
     if contacts >= 0 and largest <= RESIDUAL_TOLERANCE:
-        inverse = np.zeros((2 * segments + 8, 7))
+        inverse = work.inverse
         selected_inverse(6, 2 * segments + 2, work.solver.band, inverse)
         for i in range(segments + 1):
             for a in range(2):
                 for b in range(2):
                     value = inverse[2 * i + min(a, b), abs(a - b)] / scale
-                    work.covariance[i, a, b] = 0.0 if known[i] else value
+                    work.covariance[i, a, b] = 0.0 if buffers.known[i] else value
     return contacts, off, largest
+
+
+@compiled_within
+def _weigh(points: MeasuredPoints, start: Points, moved: Points) -> float:
+    """Write the robust weights of points against a corrected thread; return the largest change."""
+    for p in range(len(points.place)):
+        i = min(int(points.place[p]), len(start) - 2)
+        t = points.place[p] - i
+        ex, ey = start[i + 1, 0] - start[i, 0], start[i + 1, 1] - start[i, 1]
+        dx = (1.0 - t) * moved[i, 0] + t * moved[i + 1, 0]
+        dy = (1.0 - t) * moved[i, 1] + t * moved[i + 1, 1]
+        points.residual[p] = points.innovation[p] - (ex * dy - ey * dx) / math.hypot(ex, ey)
+    return robust_weights(points.residual, points.variance, points.weight)
 
 
 class Correction(NamedTuple):
@@ -362,14 +370,15 @@ class Corrector:
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
         self._formulation, self._work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
-        self._work.known[[0, *predictor.fixed_nodes]] = True
+        self._correct = TypedKernel(correct)
+        self._work.program.known[[0, *predictor.fixed_nodes]] = True
 
     def solve(self, prior: Prior, points: MeasuredPoints) -> Correction:
         """Solve the program about a predicted thread; the weights of the points are written."""
         rod, workspace, work = self._formulation.rod, self._formulation.workspace.data, self._work
         scale = float(max((1.0 / prior.density[1:]).max(), (points.share / points.variance).max()))
         prior_information(prior, scale, rod.clamped, work.program)
-        contacts, off, residual = correct(rod, workspace, work, prior.positions, prior.heading, scale, points)
+        contacts, off, residual = self._correct(rod, workspace, work, prior, scale, points)
         problem, segments = "", len(prior.positions) - 1
         if contacts < 0:
             problem = f"the correction has more than {CONTACTS_PER_NODE} contacts a node"

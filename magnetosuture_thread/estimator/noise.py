@@ -32,11 +32,8 @@ GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]
 NOISE_TIME = 1.0  # s; over which likelihoods of intensities are forgotten
-RATIO_TIME = 0.15  # s; over which the covariance of innovations is matched to them; a few frames of 16 windows
-LEARNING_PRIOR = 0.2  # s of measurements, that the scale to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
 SURE = 3.0  # standard deviations
-SWITCHING = 1e-4  # share of the weights that every intensity gets anew each second: the noise may change at once
 
 
 @dataclass(frozen=True)
@@ -186,12 +183,12 @@ def learn(
     ratio, scale, both = noise.ratio, noise.scale, seen & np.isfinite(noise.last_mean)
     if seen.any():
         square = float((mean[seen] ** 2 / expected[seen]).mean())
-        # A frame's normalised square counts up to 4 in the ratio.
-        ratio *= float(np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square, 4.0) - 1.0)))
+        # Over 0.15 s, a few frames of 16 windows; a frame's normalised square counts up to 4 in the ratio.
+        ratio *= float(np.exp(min(elapsed / 0.15, 1.0) * (min(square, 4.0) - 1.0)))
     if both.any():
         apart = (mean - noise.last_mean)[both] ** 2 / (camera + noise.last_variance)[both]
-        # The scale is learned over 5 s.
-        share = min(elapsed / (min(noise.learned_for, 5.0) + LEARNING_PRIOR), 1.0)
+        # The scale is learned over 5 s; what it begins with is worth measurements of 0.2 s.
+        share = min(elapsed / (min(noise.learned_for, 5.0) + 0.2), 1.0)
         scale += share * (float(np.minimum(apart, MAX_SCALE).mean()) - scale)
         scale = min(max(scale, MIN_SCALE), MAX_SCALE)
     error, variance, likelihood, intensity = learn_intensity(noise, mean, own, elapsed)
@@ -223,7 +220,8 @@ def learn_intensity(
         own: r of each, inf where nothing is measured, shape (w,) [m^2].
         elapsed: since the last measurement [s].
     """
-    keep, switched = np.exp(-elapsed / NOISE_TIME), min(1.0, SWITCHING * elapsed)
+    # Every intensity gets a share of the weights anew each second: the noise may change at once.
+    keep, switched = np.exp(-elapsed / NOISE_TIME), min(1.0, 1e-4 * elapsed)
     prior, own, off = noise.variance + GRID * elapsed, own[:, None], mean[:, None] - noise.error
     expected = prior + own
     logs = keep * np.log(noise.likelihood) - 0.5 * (np.log(expected) + off * off / expected)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -14,6 +14,7 @@ from magnetosuture_thread.geometry.barrier import Barrier, load_barriers
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import configuration_fields, quantity
+from magnetosuture_thread.thread.barriers import SelfContact
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import (
     MATERIALS,
@@ -28,17 +29,11 @@ from magnetosuture_thread.thread.material import (
 from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
-from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import SOLVERS
 
 OF_MEDIUM = {
-    "viscosity": "liquid",
-    "wetted_fraction": "liquid",
-    "drag_anisotropy": "liquid",
-    "mass_per_length": "air",
-    "air_drag": "air",
-    "bending_damping": "air",
-    "gravity": "air",
+    **dict.fromkeys(("viscosity", "wetted_fraction", "drag_anisotropy"), "liquid"),
+    **dict.fromkeys(("mass_per_length", "air_drag", "bending_damping", "gravity"), "air"),
 }
 FIXED = {  # why a node cannot change it while it is configured
     "autostart": "read at the start",
@@ -173,57 +168,50 @@ class ThreadModelSettings(
 
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
-        if self.friction_threshold > self.margin_range:
-            raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
-        if 0.0 < self.elastic_modulus < MIN_ELASTIC_MODULUS:
-            words = f"at least {MIN_ELASTIC_MODULUS:g} Pa, or 0 for the material's; the softest materials have 1 MPa"
-            raise self.refused("elastic_modulus", words)
-        diameter, segments = self._material().diameter, self.segments
-        if self.thread_length / segments <= diameter:
-            most = math.ceil(self.thread_length / diameter) - 1
-            raise self.refused("segments", f"at most {most}, so that a segment is longer than thick")
+        length, segments, diameter = (
+            self.thread_length,
+            self.segments,
+            self.diameter or MATERIALS[self.material].diameter,
+        )
+        most_segments, sharpest = math.ceil(length / diameter) - 1, MAX_REST_ANGLE * segments / length
+        softest = f"at least {MIN_ELASTIC_MODULUS:g} Pa, or 0 for the material's; the softest materials have 1 MPa"
         pairs = {"attachment_offset": "along and to the left", "gravity": "x and y", "flow": "x and y"}
-        for name, words in pairs.items():
-            if len(getattr(self, name)) > 2:
-                raise self.refused(name, f"two numbers, {words}, or none")
-        if self.formulation == "paper" and self.medium != "liquid":
-            raise self.refused("medium", "liquid, as the formulation paper has no inertia")
-        if self.formulation == "paper" and self.flow:
-            raise self.refused("flow", "none, as the formulation paper has no drag")
-        if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
-            limit = MAX_REST_ANGLE * segments / self.thread_length
-            words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
-            raise self.refused("rest_curvature", words)
-        for about in configuration_fields(type(self)):
-            other = OF_MEDIUM.get(about.name, self.medium)
-            if other != self.medium and getattr(self, about.name) != about.default:
-                words = f"{about.default}, its default: it counts for medium: {other} only"
-                raise self.refused(about.name, words)
-        if 0.0 < self.forecast_horizon < self.forecast_step:
-            raise self.refused("forecast_horizon", f"0, or at least forecast_step, {self.forecast_step:g} s")
-        if max(self.fixed_nodes, default=0) > segments:
-            raise self.refused("fixed_nodes", f"nodes from 1 to {segments}")
+        horizon, step, is_paper = self.forecast_horizon, self.forecast_step, self.formulation == "paper"
+        curled = f"at most {sharpest:.0f} 1/m with {segments} segments, which turn by half a radian then"
+        reach = f"at most {self.GROUP}.margin_range, {self.margin_range:g} m"
+        for wrong, name, expected in (
+            (self.friction_threshold > self.margin_range, "friction_threshold", reach),
+            (0.0 < self.elastic_modulus < MIN_ELASTIC_MODULUS, "elastic_modulus", softest),
+            (segments > most_segments, "segments", f"at most {most_segments}, so that a segment is longer than thick"),
+            *((len(getattr(self, name)) > 2, name, f"two numbers, {of}, or none") for name, of in pairs.items()),
+            (is_paper and self.medium != "liquid", "medium", "liquid, as the formulation paper has no inertia"),
+            (is_paper and self.flow, "flow", "none, as the formulation paper has no drag"),
+            (abs(self.rest_curvature) > sharpest, "rest_curvature", curled),
+            *self._of_another_medium(),
+            (0.0 < horizon < step, "forecast_horizon", f"0, or at least forecast_step, {step:g} s"),
+            (max(self.fixed_nodes, default=0) > segments, "fixed_nodes", f"nodes from 1 to {segments}"),
+        ):
+            if wrong:
+                raise self.refused(name, expected)
+
+    def _of_another_medium(self) -> Iterator[tuple[bool, str, str]]:
+        """Yield of each setting whether it counts for another medium only, its name, and what is expected."""
+        for field in configuration_fields(type(self)):
+            medium = OF_MEDIUM.get(field.name, self.medium)
+            set_for_nothing = medium != self.medium and getattr(self, field.name) != field.default
+            yield set_for_nothing, field.name, f"{field.default}, its default: it counts for medium: {medium} only"
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
-        return replace(
-            material,
-            diameter=self.diameter or material.diameter,
-            elastic_modulus=self.elastic_modulus or material.elastic_modulus,
-        )
+        modulus = self.elastic_modulus or material.elastic_modulus
+        return replace(material, diameter=self.diameter or material.diameter, elastic_modulus=modulus)
 
     def thread(self) -> Thread:
         """Return the thread."""
-        thread = Thread.of(
-            self._material(),
-            length=self.thread_length,
-            segments=self.segments,
-            attachment=Attachment(self.attachment),
-            viscosity=self.viscosity,
-            wetted_fraction=self.wetted_fraction,
-            drag_anisotropy=self.drag_anisotropy,
-            rest_curvature=self.rest_curvature,
-        )
+        names = "segments", "viscosity", "wetted_fraction", "drag_anisotropy", "rest_curvature"
+        numbers = {name: getattr(self, name) for name in names}
+        kind = Attachment(self.attachment)
+        thread = Thread.of(self._material(), length=self.thread_length, attachment=kind, **numbers)
         if self.medium == "air":
             air = Medium.air(self.mass_per_length, self.gravity, self.air_drag, self.bending_damping)
             thread = replace(thread, medium=air)
@@ -251,30 +239,27 @@ class ThreadModelSettings(
         Raises:
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
-        self._in_the_void(scene).warm_up()
-        return self._predictor(scene, load_barriers(self.barriers, f"{self.GROUP}.barriers"))
+        self._predictor(scene, empty=True).warm_up()
+        return self._predictor(scene)
 
-    def _in_the_void(self, scene: Scene | None) -> ThreadPredictor:
-        """Return a predictor for a warm-up, with the kernels of a scene and without its wall, shapes and barriers."""
-        thread = self.thread()
-        touches_itself = scene is not None and scene.dish.has_self_contact(thread.diameter)
-        return self._predictor(None, [SelfContact(thread)] if touches_itself and self.formulation == "rod" else [])
-
-    def _predictor(self, scene: Scene | None, barriers: Sequence[Barrier]) -> ThreadPredictor:
+    def _predictor(self, scene: Scene | None, *, empty: bool = False) -> ThreadPredictor:
+        """Return a predictor; for a warm-up one with the kernels of a scene, without its wall, shapes and barriers."""
+        thread, names = self.thread(), ("margin_range", "contact_tolerance", "residual_tolerance", "max_step")
+        barriers: Sequence[Barrier] = ()
+        if not empty:
+            barriers = load_barriers(self.barriers, f"{self.GROUP}.barriers")
+        elif scene is not None and scene.dish.has_self_contact(thread.diameter) and self.formulation == "rod":
+            barriers = (SelfContact(thread),)
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
-        paper = PaperOptions.tuned(weight)._replace(damping=self.paper_damping)
         return ThreadPredictor(
-            self.thread(),
-            scene,
+            thread,
+            None if empty else scene,
             barriers,
             formulation=self.formulation,
             solver=self.solver,
-            paper=paper,
-            margin_range=self.margin_range,
-            contact_tolerance=self.contact_tolerance,
-            residual_tolerance=self.residual_tolerance,
-            max_step=self.max_step,
+            paper=PaperOptions.tuned(weight)._replace(damping=self.paper_damping),
             fixed_nodes=self.fixed_nodes,
+            **{name: getattr(self, name) for name in names},
         )
 
     @property
@@ -294,9 +279,8 @@ class ThreadModelSettings(
         if not self.is_estimated:
             return None
         options = EstimatorOptions(self.estimator_history)
-        ThreadEstimator(self._in_the_void(scene), options).warm_up()
-        barriers = load_barriers(self.barriers, f"{self.GROUP}.barriers")
-        return EstimatorSession(ThreadEstimator(self._predictor(scene, barriers), options))
+        ThreadEstimator(self._predictor(scene, empty=True), options).warm_up()
+        return EstimatorSession(ThreadEstimator(self._predictor(scene), options))
 
     def friction_law(self) -> FrictionLaw:
         """Return the friction law."""

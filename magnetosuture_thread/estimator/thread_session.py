@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.session import observation_of
+from magnetosuture_thread.estimator.estimator import observation_of
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
@@ -29,13 +28,10 @@ MAX_WAITING_POSES = 30  # poses that may wait for the centreline of their frame
 MAX_LATENESS = 1_000_000_000  # ns; a pose older by more than this is not late: time itself was set back
 PARTIAL_WAIT = 1_000_000_000  # ns; for all of the thread to be seen, before the rest of a part is extrapolated
 WAITING = "waiting for the thread to be seen"
-_OBSTACLES = (Disc((0.0, 0.0), 1e-3), Polygon(((0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3))))  # one of each kind
-ACCELERATION = 1.5e-3  # m/s per root of a second; random walk of the velocity, as tracked needles move in closed loop
-TURNING = 0.2  # rad/s per root of a second; the same of the rate of turning
-MAX_SPEED, MAX_TURNING = 0.01, 3.0  # m/s, rad/s; standard deviations of a velocity of which nothing is known
 MANEUVER = 16.0  # normalized square of three innovations, of which a motion without a change of mind exceeds 0.1 %
-UNKNOWN_MOTION = np.diag((MAX_SPEED**2, MAX_SPEED**2, MAX_TURNING**2))
-NOISE_RATES = np.array((ACCELERATION, ACCELERATION, TURNING)) ** 2
+UNKNOWN_MOTION = np.diag((0.01, 0.01, 3.0)) ** 2  # variances of a velocity of which nothing is known [m/s], [rad/s]
+NOISE_RATES = np.array((1.5e-3, 1.5e-3, 0.2)) ** 2
+"""Of the random walks of the velocity, as tracked needles move in closed loop [m^2/s^3], and of turning [rad^2/s^3]."""
 
 
 @dataclass(frozen=True)
@@ -170,21 +166,19 @@ class NeedleMotionFilter:
         state, before = self._state, self._covariance
         # Between poses more than 0.2 s apart nothing is known of the motion.
         if not known or interval > 0.2:
-            state[:3], state[3:] = measured, 0.0
-            before[:] = 0.0
+            state[:3], state[3:], before[:] = measured, 0.0, 0.0
             before[:3, :3], before[3:, 3:] = variances, UNKNOWN_MOTION
             return pose
         # It moves by the velocity in the middle of the interval, in which the noise is added.
         middle = float(state[2] + 0.5 * interval * state[5])
         c, s = math.cos(middle), math.sin(middle)
-        x, y = state[3] * c - state[4] * s, state[3] * s + state[4] * c
-        state[:3] += interval * x, interval * y, interval * state[5]
-        move, half = np.eye(6), np.zeros((6, 3))
-        move[0, 2:] = -interval * y, interval * c, -interval * s, -0.5 * interval**2 * y
-        move[1, 2:] = interval * x, interval * s, interval * c, 0.5 * interval**2 * x
-        move[2, 5] = interval
-        half[:3] = 0.5 * interval * np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        half[3:] = np.eye(3)
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        x, y, turning = turned @ state[3:]
+        state[:3] += interval * x, interval * y, interval * turning
+        move, half = np.eye(6), np.vstack([0.5 * interval * turned, np.eye(3)])
+        move[:3, 3:] = interval * turned
+        move[:2, 2] = -interval * y, interval * x
+        move[:2, 5] = 0.5 * interval * move[:2, 2]
         noise = (half * interval * NOISE_RATES) @ half.T
         covariance = move @ before @ move.T + noise
         innovation = measured - state[:3]
@@ -200,13 +194,9 @@ class NeedleMotionFilter:
         before[:] = covariance - gain @ covariance[:3, :]
         c, s = math.cos(state[2]), math.sin(state[2])
         along, across, turning = state[3:].tolist()
-        return replace(
-            pose,
-            tail=state[:2].copy(),
-            heading=np.array([c, s]),
-            deviation=(math.sqrt(0.5 * (before[0, 0] + before[1, 1])), math.sqrt(before[2, 2])),
-            motion=NeedleMotion(np.array([along * c - across * s, along * s + across * c]), turning),
-        )
+        deviation = math.sqrt(0.5 * (before[0, 0] + before[1, 1])), math.sqrt(before[2, 2])
+        motion = NeedleMotion(np.array([along * c - across * s, along * s + across * c]), turning)
+        return replace(pose, tail=state[:2].copy(), heading=np.array([c, s]), deviation=deviation, motion=motion)
 
 
 class ThreadSession:
@@ -231,8 +221,6 @@ class ThreadSession:
 
     def __init__(self, settings: ThreadModelSettings, scene: Scene | None) -> None:
         self.settings, self.scene = settings, scene
-        # Obstacles may come later, and no callback shall wait for the compiler of what they need.
-        Workspace(_OBSTACLES, settings.margin_range)
         self.reset()
 
     def reset(self) -> None:

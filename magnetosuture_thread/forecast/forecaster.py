@@ -36,7 +36,7 @@ from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import PredictorOptions, ThreadPredictor
-from magnetosuture_thread.thread.program import ABOUT, CONTACTS_PER_NODE, Table
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation, StepInput
 from magnetosuture_thread.thread.step import WarmStart
 
@@ -109,10 +109,9 @@ class ForecastStart:
         """
         if predictor.state is None or predictor.pose is None:
             raise InvalidInputError("predictor", "one before its start", "one that has started")
-        state = predictor.state
+        state, pose = predictor.state, predictor.pose if pose is None else pose
         warm_start = predictor.formulation.warm_start() if state.interval > 0.0 else None
-        own = predictor.pose if pose is None else pose
-        return cls(own, state.positions, state.velocities, state.interval, tip_velocity, warm_start, needle_force)
+        return cls(pose, state.positions, state.velocities, state.interval, tip_velocity, warm_start, needle_force)
 
 
 @dataclass(frozen=True)
@@ -207,13 +206,13 @@ class Forecast:
     @cached_property
     def minima(self) -> dict[str, ForecastMargin]:
         """The least margin of each kind over the horizon, by the kind's name."""
-        return {name: self._minimum(kind, name) for kind, name in enumerate(KINDS)}
+        return {name: self._margin(kind, int(self.margins[name].argmin())) for kind, name in enumerate(KINDS)}
 
-    def _minimum(self, kind: int, name: str) -> ForecastMargin:
-        at = int(self.margins[name].argmin())
-        value, shape = float(self.margins[name][at]), int(self.margin_shapes[at, kind])
-        named = self.shapes[shape] if shape != NO_SHAPE else ""
-        return ForecastMargin(value, float(self.times[at]), int(self.margin_nodes[at, kind]), named)
+    def _margin(self, kind: int, instant: int) -> ForecastMargin:
+        """Return the margin of a kind at an instant."""
+        node, shape = int(self.margin_nodes[instant, kind]), int(self.margin_shapes[instant, kind])
+        name = self.shapes[shape] if shape != NO_SHAPE else ""
+        return ForecastMargin(float(self.margins[KINDS[kind]][instant]), float(self.times[instant]), node, name)
 
     @cached_property
     def friction_nodes(self) -> tuple[int, ...]:
@@ -239,15 +238,13 @@ class Forecast:
     @cached_property
     def first_contact(self) -> ForecastContact | None:
         """When the thread first touches a shape or the wall, and which; None if it does not."""
-        both = [self.margins[KINDS[kind]] for kind in (OBSTACLE_MARGIN, WALL_MARGIN)]
-        touches = np.flatnonzero(np.min(both, axis=0) <= self.contact_tolerance)
+        both = np.array([self.margins[KINDS[kind]] for kind in (OBSTACLE_MARGIN, WALL_MARGIN)])
+        touches = np.flatnonzero(both.min(axis=0) <= self.contact_tolerance)
         if not len(touches):
             return None
-        at, kind = int(touches[0]), WALL_MARGIN
-        if both[0][at] <= both[1][at]:
-            kind = OBSTACLE_MARGIN
-        node, shape = int(self.margin_nodes[at, kind]), int(self.margin_shapes[at, kind])
-        return ForecastContact(float(self.times[at]), node, self.shapes[shape])
+        instant = int(touches[0])
+        margin = self._margin((OBSTACLE_MARGIN, WALL_MARGIN)[int(both[:, instant].argmin())], instant)
+        return ForecastContact(margin.time, margin.node, margin.shape)
 
     @cached_property
     def rest_time(self) -> float | None:
@@ -356,16 +353,14 @@ class _ThreadWalk:
                 self.converged = False
                 room = f"more than {CONTACTS_PER_NODE * len(self.positions)} contacts at once"
                 return room if progress.code == NO_ROOM else "a step has no solution within the tolerance"
-            (self.positions, self._velocities), self._interval = formulation.buffers.end, interval / count
+            (self.positions, self._velocities), self._interval = formulation.buffers.end[:2], interval / count
             self.converged = self.converged and progress.off <= 1.0
         return ""
 
     def write_forces(self, heading: Vector, tension: Vector, pull: Vector) -> None:
         """Write the tension of each segment and the thread's pull upon the needle [N]."""
         buffers = self._formulation.buffers
-        loads = buffers.internal, buffers.tail_load
-        moved = buffers.motion[ABOUT], self._velocities, self._interval
-        self._formulation.write_forces(*moved, heading, loads, tension, pull)
+        self._formulation.write_forces((buffers.end, buffers.tail_load), self._interval, heading, tension, pull)
 
 
 class ThreadForecaster:
@@ -433,8 +428,7 @@ class ThreadForecaster:
         self.thread, self.scene, self.safety, self.step = thread, scene, safety, float(step)
         self._formulation, self._law, self._averaging = formulation, law, float(friction_averaging)
         self._needle, self._drag = safety.compiled_data(), DragData() if drag is None else drag.data(thread)
-        self._offset = tuple(float(part) for part in attachment_offset or (0.0, 0.0))
-        self._nodes = np.array([0, *predictor.fixed_nodes], np.int64)
+        self._offset, self._nodes = tuple(attachment_offset), np.array([0, *predictor.fixed_nodes], np.int64)
         reach = self.options.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
         self._around = Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius).data
         self._step_needle, self._friction_nodes = TypedKernel(step_needle), TypedKernel(nodes_under_friction)
@@ -490,7 +484,7 @@ class ThreadForecaster:
         problem, done = "", 0
         for k in range(instants):
             vertices[k], poses[k] = walk.positions, pose
-            slowdown[k] = friction(vertices[k], interval, rubbed[k])
+            slowdown[k] = friction(vertices[k], rubbed[k])
             if k < steps and callable(commands):
                 velocity = commands(k * interval, pose[:2].copy(), pose[2:].copy())
                 sequence[k] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
@@ -508,7 +502,10 @@ class ThreadForecaster:
             walk.write_forces(pose[2:], tension[k + 1], pull[k + 1])
             done = k + 1
         instants = done + 1
-        self._write_margins(vertices[:instants], poses[:instants, 2:].copy(), margin, margin_nodes, margin_shapes)
+        memory = self._contacts(), np.empty((nodes, 2)), np.empty((5, nodes - 1))
+        walked = self._formulation.rod, self._around, vertices[:instants], poses[:instants, 2:].copy()
+        if not least_margins(*walked, *memory, margin, margin_nodes, margin_shapes):
+            raise InvalidInputError("scene", "more contacts than there is memory for", "fewer shapes")
         return Forecast(
             stamp=start.pose.stamp,
             times=interval * np.arange(float(instants)),
@@ -532,29 +529,21 @@ class ThreadForecaster:
             touched=touched[:done],
         )
 
-    def _friction(self, start: ForecastStart, slowed: bool) -> Callable[[Points, float, NDArray[np.bool_]], float]:
+    def _friction(self, start: ForecastStart, slowed: bool) -> Callable[[Points, NDArray[np.bool_]], float]:
         """Return the friction law over one forecast: it writes the nodes under friction, and returns the slowdown."""
         law, nodes, averaging = self._law, self.thread.segments + 1, self._averaging
-        contacts, close, (last, velocities) = self._contacts(), np.zeros(nodes, np.int64), np.zeros((2, nodes, 2))
+        if law is None:
+            return lambda vertices, rubbed: 1.0
+        last, velocities = np.array([start.vertices, np.zeros((nodes, 2))], np.float64)
         share = 1.0 - math.exp(-self.step / averaging) if averaging > 0.0 else 1.0
+        memory = last, velocities, share, self.step, self._around, law.threshold + 0.5 * self.thread.diameter
+        contacts, close = self._contacts(), np.zeros(nodes, np.int64)
 
-        def slowdown(vertices: Points, interval: float, rubbed: NDArray[np.bool_]) -> float:
-            if law is None:
-                return 1.0
-            limit = law.threshold + 0.5 * self.thread.diameter
-            motion = vertices, last, velocities, share, interval
-            count, fastest = self._friction_nodes(*motion, self._around, limit, contacts, close, rubbed)
+        def slowdown(vertices: Points, rubbed: NDArray[np.bool_]) -> float:
+            count, fastest = self._friction_nodes(vertices, *memory, contacts, close, rubbed)
             return law.beta**count if count and slowed and fastest > law.stuck_speed else 1.0
 
-        last[:] = start.vertices
         return slowdown
-
-    def _write_margins(self, vertices: Table, headings: Points, *margins: NDArray[Any]) -> None:
-        """Write the least margins of the thread at each instant; see `least_margins`."""
-        segments = self.thread.segments
-        memory = self._contacts(), np.empty((segments + 1, 2)), np.empty((5, segments))
-        if not least_margins(self._formulation.rod, self._around, vertices, headings, *memory, *margins):
-            raise InvalidInputError("scene", "more contacts than there is memory for", "fewer shapes")
 
     def _contacts(self) -> Contacts:
         """Return memory for all contacts of the thread's nodes."""
@@ -577,7 +566,7 @@ class ThreadForecaster:
 
     def _attached(self, tail: Vector, heading: Vector) -> Vector:
         """Return where the thread is fixed, shape (2,) [m]."""
-        if not any(self._offset):
+        if not self._offset:
             return tail
         (x, y), (along, left) = heading, self._offset
         return np.asarray(tail + np.array([along * x - left * y, along * y + left * x]))
@@ -619,22 +608,14 @@ def make_forecaster(
         ConfigurationError: see `ThreadForecaster`.
     """
     if safety is None:
-        safety = NeedleSafetyFilter(
-            scene,
-            keep_out=settings.keep_out + settings.pose_margin,
-            needle_length=settings.needle_length,
-            needle_curvature=settings.needle_curvature,
-        )
+        needle: dict[str, Any] = {
+            "needle_length": settings.needle_length,
+            "needle_curvature": settings.needle_curvature,
+        }
+        safety = NeedleSafetyFilter(scene, keep_out=settings.keep_out + settings.pose_margin, **needle)
     step = options.get("step", settings.forecast_step)
-    chosen: dict[str, Any] = {
-        "law": settings.friction_law(),
-        "friction_averaging": settings.friction_averaging,
-        "attachment_offset": settings.attachment_offset,
-        "step": step,
-        "margin_range": settings.margin_range,
-        "contact_tolerance": settings.contact_tolerance,
-        "residual_tolerance": settings.residual_tolerance,
-        "max_step": max(settings.max_step, 1.001 * step),  # against rounding
-        "fixed_nodes": settings.fixed_nodes,
-    }
+    names = "friction_averaging", "attachment_offset", "margin_range", "contact_tolerance", "residual_tolerance"
+    chosen: dict[str, Any] = {name: getattr(settings, name) for name in (*names, "fixed_nodes")}
+    # The longest step is a little longer, against rounding.
+    chosen |= {"law": settings.friction_law(), "step": step, "max_step": max(settings.max_step, 1.001 * step)}
     return ThreadForecaster(settings.thread(), scene, safety, **{**chosen, **options})

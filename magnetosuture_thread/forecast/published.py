@@ -44,19 +44,21 @@ def follow_plan(
         step: [s]
         steps: k.
     """
-    x, y, angle = pose[0], pose[1], pose[2]
-    velocities, at = np.zeros((steps, 2)), begin
+    x, y, angle, at, i = pose[0], pose[1], pose[2], begin, 1
+    velocities = np.zeros((steps, 2))
     for k in range(steps):
         ahead = min(travel[-1], at + speed * step)
-        i = min(max(int(np.searchsorted(travel, ahead)), 1), len(travel) - 1)
+        while i < len(travel) - 1 and travel[i] < ahead:
+            i += 1
         length, w = max(travel[i] - travel[i - 1], 1e-12), (ahead - at) / step
-        delta = plan[i] - plan[i - 1]
-        planned = plan[i - 1] + (ahead - travel[i - 1]) / length * delta
-        c, s = math.cos(planned[2]), math.sin(planned[2])
-        drive, rate = (delta[0] * c + delta[1] * s) / length, delta[2] / length
-        off_x, off_y = planned[0] - x, planned[1] - y
-        turn = planned[2] + math.atan(drive * (c * off_y - s * off_x) / lever) - angle
-        turn -= 2.0 * math.pi * round(turn / (2.0 * math.pi))
+        share = (ahead - travel[i - 1]) / length
+        along, left, turned = plan[i, 0] - plan[i - 1, 0], plan[i, 1] - plan[i - 1, 1], plan[i, 2] - plan[i - 1, 2]
+        off_x, off_y = plan[i - 1, 0] + share * along - x, plan[i - 1, 1] + share * left - y
+        planned = plan[i - 1, 2] + share * turned
+        c, s = math.cos(planned), math.sin(planned)
+        drive, rate = (along * c + left * s) / length, turned / length
+        turn = planned + math.atan(drive * (c * off_y - s * off_x) / lever) - angle
+        turn -= 2.0 * math.pi * math.floor(0.5 * turn / math.pi + 0.5)
         e_x, e_y = math.cos(angle), math.sin(angle)
         u, omega = w * drive + APPROACH * (off_x * e_x + off_y * e_y), w * rate + APPROACH * turn
         velocities[k, 0], velocities[k, 1] = u * e_x - lever * omega * e_y, u * e_y + lever * omega * e_x

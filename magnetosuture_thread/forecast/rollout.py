@@ -14,7 +14,7 @@ from magnetosuture_thread.geometry.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.compiled import compiled, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts, half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.barriers import segment_rows_of
+from magnetosuture_thread.thread.barriers import link_margins
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.program import Indices, Mask, Table, Vector
 
@@ -68,7 +68,7 @@ def add_pull(
         -lever * across / drag.turning,
     )
     ratio = (drag.whole / drag.bare, drag.whole / drag.across, lever * lever * drag.whole / drag.turning)
-    begins = np.isnan(added[0])
+    begins = math.isnan(added[0])
     for k in range(3):
         added[k] = full[k] if begins else added[k] + (full[k] - added[k]) / (1.0 + ratio[k])
         limit = speed if k < 2 else (speed / lever if lever > 0.0 else 0.0)
@@ -107,7 +107,7 @@ def step_needle(
     """
     needle = pose_needle(data, pose[0], pose[1], pose[2], pose[3])
     margin, shape = needle_margin(data, needle)
-    elapsed = np.inf if np.isnan(last[0]) else interval
+    elapsed = np.inf if math.isnan(last[0]) else interval
     velocity = filter_velocity(data, needle, command, slowdown, (last[0], last[1]), elapsed, touched)
     if drag.along > 0.0:
         commanded = min(math.hypot(command[0], command[1]), data.max_speed)
@@ -194,7 +194,7 @@ def least_margins(
     """
     for k in range(len(vertices)):
         points, least = vertices[k], margin[k]
-        segment_rows_of(rod, points, headings[k], work, rows)
+        link_margins(rod, points, headings[k], work, rows)
         for kind in (CONNECTIVITY_MARGIN, COMPRESSION_MARGIN):
             for i in range(rows.shape[1]):
                 left = rows[1, i] if kind == CONNECTIVITY_MARGIN else rows[3, i]

@@ -14,7 +14,13 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.compiled import (
+    compiled,
+    compiled_inline,
+    compiled_inner,
+    compiled_uncounted,
+    compiled_within,
+)
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.shapes import MIN_EXTENT, Disc, Obstacle, Polygon, triangulate
 from magnetosuture_thread.settings.configuration import bounded, checked_arguments
@@ -133,7 +139,7 @@ def pack_obstacles(
     )
 
 
-@compiled
+@compiled_inline
 def closest_on_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> tuple[float, float, float]:
     """Return the point of a segment ab that is closest to p, and where it is on the segment.
 
@@ -241,7 +247,7 @@ def add_row(start: int, count: int, length: float, direction: tuple[float, float
     return count + 1
 
 
-@compiled_uncounted
+@compiled_inner
 def search_block(
     x: float, y: float, reach: float, block: int, data: WorkspaceData, start: int, count: int, rows: ContactRows
 ) -> Nearest:
@@ -302,7 +308,7 @@ def search_block(
     return Nearest(count, best, sign * length, nx, ny, edge, block)
 
 
-@compiled_uncounted
+@compiled_inner
 def polygon_rows(
     x: float, y: float, polygon: int, reach: float, data: WorkspaceData, count: int, rows: ContactRows
 ) -> Nearest:
@@ -328,7 +334,7 @@ def polygon_rows(
     return Nearest(count, best.square, best.signed, best.x, best.y, best.edge, best.block)
 
 
-@compiled_uncounted
+@compiled_inner
 def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceData) -> Nearest:
     """Return the nearest boundary point of a polygon.
 
@@ -358,7 +364,7 @@ def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceDa
     return best
 
 
-@compiled_uncounted
+@compiled_inner
 def shape_distance(x: float, y: float, s: int, guess: int, data: WorkspaceData) -> tuple[float, float, float, int]:
     """Return the signed distance of a point in the plane from a shape, its gradient (2), and the block that is nearest.
 
@@ -625,31 +631,35 @@ def _from_polygon(
 ) -> float:
     """Return the least signed distance on a line ab from a polygon; `signed` is that of a.
 
-    Outside it is that of an end, or that of a corner of the polygon from the line.
+    Outside it is that of a, that of b from an edge, or that of a corner of the polygon from the line.
     """
-    ux, uy, edges = bx - ax, by - ay, data.edges
-    least, length = min(signed, nearest_edge(bx, by, polygon, NO_BLOCK, data).signed), math.hypot(ux, uy)
+    ux, uy, edges, least = bx - ax, by - ay, data.edges, signed * signed if signed > TOLERANCE else 0.0
+    scale = 1.0 / max(ux * ux + uy * uy, 1e-300)
+    # What is farther from a than this is farther from the line than a is from the polygon.
+    far = signed + math.sqrt(ux * ux + uy * uy)
     for block in range(data.polygons[polygon, 0], data.polygons[polygon, 1]):
-        if least <= TOLERANCE:
-            break
-        far = signed + length + data.circles[block, 2]
-        if math.hypot(ax - data.circles[block, 0], ay - data.circles[block, 1]) > far:
+        rx, ry, reach = data.circles[block, 0] - ax, data.circles[block, 1] - ay, data.circles[block, 2] + far
+        if least == 0.0 or rx * rx + ry * ry > reach * reach:
             continue
         first = data.ranges[block, 0]
-        for edge in range(first, first + data.ranges[block, 1]):
-            k = edge * EDGE_WIDTH
-            cx, cy, dx, dy = edges[k], edges[k + 1], edges[k + 2], edges[k + 3]
-            qx, qy, _ = closest_on_segment(cx, cy, ax, ay, bx, by)
-            least = min(least, math.hypot(cx - qx, cy - qy))
-            first_side, second_side = (cx - ax) * uy - (cy - ay) * ux, (dx - ax) * uy - (dy - ay) * ux
-            third_side = (ax - cx) * (dy - cy) - (ay - cy) * (dx - cx)
-            fourth_side = (bx - cx) * (dy - cy) - (by - cy) * (dx - cx)
-            if first_side * second_side < 0.0 and third_side * fourth_side < 0.0:
-                least = 0.0  # they cross
-    return least if least > TOLERANCE else _deepest(ax, ay, bx, by, polygon, data)
+        for k in range(first * EDGE_WIDTH, (first + data.ranges[block, 1]) * EDGE_WIDTH, EDGE_WIDTH):
+            dx, dy = edges[k + 4], edges[k + 5]
+            rx, ry, qx, qy = edges[k] - ax, edges[k + 1] - ay, bx - edges[k], by - edges[k + 1]
+            if rx * rx + ry * ry <= far * far:
+                t = min(max((rx * ux + ry * uy) * scale, 0.0), 1.0)
+                least = min(least, (rx - t * ux) ** 2 + (ry - t * uy) ** 2)
+            before, after = ry * dx - rx * dy, qx * dy - qy * dx  # how far a and b are from the edge's line, outwards
+            if 0.0 < qx * dx + qy * dy < edges[k + 6]:
+                least = min(least, after * after)
+            if before * after < 0.0:
+                sx, sy = edges[k + 2] - ax, edges[k + 3] - ay
+                if (rx * uy - ry * ux) * (sx * uy - sy * ux) < 0.0:
+                    least = 0.0  # they cross
+    outside = math.sqrt(least)
+    return outside if outside > TOLERANCE else _deepest(ax, ay, bx, by, polygon, data)
 
 
-@compiled_uncounted
+@compiled_inner
 def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, data: WorkspaceData) -> float:
     """Return the least signed distance of a node and the half segments beside it from one shape or the wall [m].
 

@@ -36,23 +36,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.geometry.compiled import (
-    compiled,
-    compiled_inline,
-    compiled_inner,
-    compiled_uncounted,
-    compiled_within,
-)
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.program import (
-    SPAN,
-    ChainProgram,
-    Mask,
-    Solution,
-    Table,
-    Vector,
-    residuals_of,
-)
+from magnetosuture_thread.thread.program import SPAN, ChainProgram, Mask, Solution, Table, Vector, residuals_of
 
 Axes = tuple[int, ...]
 
@@ -107,7 +93,7 @@ def factorise(axes: Axes, band: Table) -> bool:
     return True
 
 
-@compiled_uncounted
+@compiled_inner
 def substitute(axes: Axes, band: Table, x: Vector) -> None:
     """Solve L D L' x = x in place; x has room for half a width of zeros at its end."""
     width = SPAN * len(axes)
@@ -126,15 +112,7 @@ def substitute(axes: Axes, band: Table, x: Vector) -> None:
 
 
 MAX_WEIGHT = 1e7  # w_max over the scale of P: the least compliance that is exact at once
-ROUNDING_RESIDUAL = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
-STATUS = (
-    "solved",
-    "iteration limit",
-    "not positive definite",
-    "not finite",
-    "stalled",
-    "solved, after a cold start",
-)
+STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "stalled", "solved, after a cold start")
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED, RESTARTED = range(6)
 
 
@@ -148,6 +126,9 @@ class SolverBuffers(NamedTuple):
         band: of the matrix, shape (m d + 3 d, 3 d + 1).
         vectors: seven of them, of the unknowns and of the rows.
         active: the rows whose multipliers change with the velocities.
+        far_columns: of `solve_far_rows`, shape (w, m d + 3 d).
+        far_matrix: the same, shape (w, w).
+        far_pull: the same, shape (w,).
     """
 
     axes: Axes
@@ -156,6 +137,9 @@ class SolverBuffers(NamedTuple):
     band: Table
     vectors: Table
     active: Mask
+    far_columns: Table
+    far_matrix: Table
+    far_pull: Vector
 
 
 class BandedSolver:
@@ -169,29 +153,31 @@ class BandedSolver:
     name = "banded"
 
     def __init__(self, tolerance: float = 1e-8, iterations: int = 60) -> None:
-        empty = np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_)
-        self._buffers = SolverBuffers((), tolerance, iterations, *empty)
+        empty, nothing = np.empty((0, 0)), np.empty(0)
+        memory = empty, np.empty((7, 0)), np.empty(0, np.bool_), empty, empty, nothing
+        self._buffers = SolverBuffers((), tolerance, iterations, *memory)
 
     def solve(self, program: ChainProgram, velocities: Points, multipliers: Vector) -> Solution:
         """Solve one program, started from a guess; see `Solver`."""
         nodes, dimension = program.linear.shape
-        buffers = self.buffers(nodes, dimension, len(program.lower))
+        buffers = self.buffers(nodes, dimension, len(program.lower), len(program.far_nodes))
         u, found = velocities.copy(), multipliers.copy()
         status, iterations = solve(program, u, found, buffers)
         return Solution(u, found, self.name, STATUS[status], iterations, residuals_of(program, u, found))
 
-    def buffers(self, nodes: int, dimension: int, rows: int) -> SolverBuffers:
-        """Return what the compiled solver needs for programs of at most so many rows."""
-        width = SPAN * dimension
+    def buffers(self, nodes: int, dimension: int, rows: int, far: int = 0) -> SolverBuffers:
+        """Return what the compiled solver needs for programs of at most so many rows, and so many far ones of them."""
+        width, kept = SPAN * dimension, self._buffers
         unknowns = nodes * dimension + width
-        if self._buffers.band.shape != (unknowns, width + 1):
-            axes = (0, 1, 2)[:dimension]
-            self._buffers = self._buffers._replace(axes=axes, band=np.empty((unknowns, width + 1)))
-        wanted = max(unknowns, rows)
-        if self._buffers.vectors.shape[1] < wanted:
-            vectors, active = np.empty((7, wanted)), np.empty(wanted, dtype=np.bool_)
-            self._buffers = self._buffers._replace(vectors=vectors, active=active)
-        return self._buffers
+        if kept.band.shape != (unknowns, width + 1):
+            kept = kept._replace(axes=(0, 1, 2)[:dimension], band=np.empty((unknowns, width + 1)))
+        if kept.vectors.shape[1] < (wanted := max(unknowns, rows)):
+            kept = kept._replace(vectors=np.empty((7, wanted)), active=np.empty(wanted, np.bool_))
+        if len(kept.far_pull) < far or kept.far_columns.shape[1] != unknowns:
+            far_memory = np.empty((far, unknowns)), np.empty((far, far)), np.empty(far)
+            kept = kept._replace(far_columns=far_memory[0], far_matrix=far_memory[1], far_pull=far_memory[2])
+        self._buffers = kept
+        return kept
 
 
 @compiled_inline
@@ -270,7 +256,7 @@ def forces(
                 largest = max(largest, abs(smooth[j] - force[j]))
             worst = max(worst, abs(force[j]))
             total += force[j]
-    return worst if np.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
+    return worst if math.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
 
 
 @compiled_inner
@@ -363,38 +349,39 @@ def solve_positive_definite(matrix: Table, x: Vector) -> bool:
     return True
 
 
-@compiled
-def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: Mask, band: Table, step: Vector) -> bool:
+@compiled_within
+def solve_far_rows(program: ChainProgram, weights: Vector, buffers: SolverBuffers, step: Vector) -> bool:
     """Turn B^-1 F in `step` into F'^-1 F, with the factor of B in the band.
 
     Returns:
         Whether F' is positive definite.
     """
-    d, chain = len(axes), len(program.first)
-    chosen, count = np.empty(len(program.far_nodes), np.int64), 0
-    for r in range(len(chosen)):
-        if active[chain + r]:
-            chosen[count] = r
-            count += 1
-    columns, matrix, pull = np.zeros((count, len(band))), np.zeros((count, count)), np.zeros(count)
-    for p in range(count):
+    axes, columns, matrix, pull = buffers.axes, buffers.far_columns, buffers.far_matrix, buffers.far_pull
+    d, chain, count = len(axes), len(program.first), 0
+    for r in range(len(program.far_nodes)):
+        if not buffers.active[chain + r]:
+            continue
+        for j in range(columns.shape[1]):
+            columns[count, j] = 0.0
+        pull[count] = 0.0
         for k in range(program.far_nodes.shape[1]):
-            node = program.far_nodes[chosen[p], k]
-            for a in range(0 if program.known[node] else d):
-                columns[p, node * d + a] += program.far_gradient[chosen[p], k, a]
-        substitute(axes, band, columns[p])
-    for p in range(count):
-        matrix[p, p] = 1.0 / weights[chain + chosen[p]]
-        for k in range(program.far_nodes.shape[1]):
+            node = program.far_nodes[r, k]
             for a in range(d):
-                value, j = program.far_gradient[chosen[p], k, a], program.far_nodes[chosen[p], k] * d + a
-                pull[p] += value * step[j]
-                for q in range(count):
-                    matrix[p, q] += value * columns[q, j]
-    if not solve_positive_definite(matrix, pull):
+                value = program.far_gradient[r, k, a]
+                pull[count] += value * step[node * d + a]
+                columns[count, node * d + a] += 0.0 if program.known[node] else value
+        substitute(axes, buffers.band, columns[count])
+        for q in range(count + 1):
+            matrix[count, q] = 1.0 / weights[chain + r] if q == count else 0.0
+            for k in range(program.far_nodes.shape[1]):
+                for a in range(d):
+                    value, j = program.far_gradient[r, k, a], program.far_nodes[r, k] * d + a
+                    matrix[count, q] += value * columns[q, j]
+        count += 1
+    if not solve_positive_definite(matrix[:count, :count], pull[:count]):
         return False
     for p in range(count):
-        for j in range(len(step)):
+        for j in range(program.linear.size):
             step[j] -= pull[p] * columns[p, j]
     return True
 
@@ -427,7 +414,7 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
         # The first guess: what pushed before pushes again, though it may seem to pull.
         if multipliers[r] == 0.0 and centre[r] != 0.0 and limit[r] == np.inf:
             bound = lower[r] if centre[r] > 0.0 else upper[r]
-            if np.isfinite(bound):
+            if math.isfinite(bound):
                 hard = 1.0 / weights[r] - compliance[r]
                 multipliers[r] = weights[r] * (bound - image[r] + hard * centre[r])
         active[r] = is_active(limit[r], multipliers[r])
@@ -436,14 +423,20 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
 @compiled_uncounted
 def solve(program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> tuple[int, int]:
     """Improve u and the multipliers in place; return status and iterations."""
-    axes, tolerance, iterations, band, vectors, active = buffers
+    axes, tolerance, band, vectors, active = (
+        buffers.axes,
+        buffers.tolerance,
+        buffers.band,
+        buffers.vectors,
+        buffers.active,
+    )
     d, width, rows, unknowns = len(axes), SPAN * len(axes), len(program.lower), program.linear.size
     step, force, smooth = vectors[0, : len(band)], vectors[1, :unknowns], vectors[2, :unknowns]
     weights, centre, image, before = vectors[3], vectors[4], vectors[5], vectors[6]
     begin(axes, program, u, multipliers, buffers)
     forces(axes, program, smooth, multipliers, force)
     changes, stalled, least = 1, 0, np.inf
-    for iteration in range(1, iterations + 1):
+    for iteration in range(1, buffers.iterations + 1):
         if changes:
             assemble_matrix(axes, program, weights, active, band)
             if not factorise(axes, band):
@@ -452,7 +445,7 @@ def solve(program: ChainProgram, u: Points, multipliers: Vector, buffers: Solver
         _copy(force, -1.0, unknowns, step)
         step[unknowns : unknowns + width] = 0.0
         substitute(axes, band, step)
-        if len(program.far_nodes) > 0 and not solve_far_rows(axes, program, weights, active, band, step):
+        if len(program.far_nodes) > 0 and not solve_far_rows(program, weights, buffers, step):
             return INDEFINITE, iteration
         for j in range(unknowns):
             start += smooth[j] * step[j]
@@ -470,19 +463,19 @@ def solve(program: ChainProgram, u: Points, multipliers: Vector, buffers: Solver
             scale = evaluate(axes, program, u, smooth, image)
             _, gap = update(program, image, centre, weights, multipliers, active)
         worst, largest = forces(axes, program, smooth, multipliers, force)
-        if not np.isfinite(worst):
+        if not math.isfinite(worst):
             return NOT_FINITE, iteration
         size = max(scale, largest)
         stalled += changes == 0 and worst > max(0.5 * least, tolerance * size)
         least = min(least, worst)
         if worst <= tolerance * size and gap <= tolerance:
             return SOLVED, iteration
-        # After three Newton steps without a gain rounding allows for no more.
+        # After three Newton steps without a gain rounding allows for no more; an imbalance of 1e-6 is a solution then.
         if stalled > 3:
-            return SOLVED if max(worst / size, gap) <= ROUNDING_RESIDUAL else STALLED, iteration
+            return SOLVED if max(worst / size, gap) <= 1e-6 else STALLED, iteration
         if worst <= tolerance * size:
             _copy(multipliers, 1.0, rows, centre)
             turned, gap = update(program, image, centre, weights, multipliers, active)
             changes += turned
             forces(axes, program, smooth, multipliers, force)
-    return LIMIT, iterations
+    return LIMIT, buffers.iterations

@@ -20,22 +20,61 @@ from magnetosuture_thread.geometry.barrier import (
     BarrierRows,
     RowBarrier,
 )
-from magnetosuture_thread.geometry.compiled import compiled_uncounted
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
 from magnetosuture_thread.geometry.obstacles import (
-    Contacts,
     Workspace,
     WorkspaceData,
-    find_contacts,
     half_segment_distance,
+    nearest_edge,
     wall_contact,
 )
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.errors import ConfigurationError, SolverError
+from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.mechanics import RodProperties, chord_lengths
+
+Vector = NDArray[np.float64]
+Table = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@compiled_inline
+def distance_row(points: Points, i: int, j: int, rest: float) -> tuple[float, float]:
+    """Return h = (rest^2 - |x_j - x_i|^2) / 2, with the gradient x_j - x_i by x_i, and the distance |x_j - x_i|."""
+    square = 0.0
+    for a in range(points.shape[1]):
+        square += (points[j, a] - points[i, a]) ** 2
+    return 0.5 * (rest * rest - square), math.sqrt(square)
+
+
+@compiled
+def _write_distances(points: Points, apart: int, rest: Vector, value: Vector, distance: Vector) -> None:
+    for i in range(len(value)):
+        value[i], distance[i] = distance_row(points, i, i + apart, rest[i])
+
+
+class _DistanceBarrier(RowBarrier):
+    """A barrier of the distances of nodes some segments apart, h = +-(rest^2 - |x_i - x_{i-apart}|^2) / 2."""
+
+    apart, sign = 1, 1.0
+
+    def _rows(self, positions: Points, rest: float | Vector) -> BarrierRows:
+        along, first = positions[self.apart :] - positions[: -self.apart], np.arange(len(positions) - self.apart)
+        rests, (value, distance) = np.array(np.broadcast_to(rest, first.shape), np.float64), np.empty((2, len(first)))
+        _write_distances(np.array(positions, np.float64), self.apart, rests, value, distance)
+        return BarrierRows(
+            name=self.name,
+            nodes=np.column_stack([first, first + self.apart]),
+            obstacle=np.full(len(first), NO_OBSTACLE),
+            value=self.sign * value,
+            gradient=self.sign * np.stack([along, -along], axis=1),
+            clearance=self.sign * (rest - distance),
+        )
 
 
 @dataclass(frozen=True)
-class Connectivity(RowBarrier):
+class Connectivity(_DistanceBarrier):
     """No segment is longer than its rest length.
 
         h_con,i = (D^2 - |x_i - x_{i-1}|^2) / 2,    i = 1 ... n
@@ -53,11 +92,11 @@ class Connectivity(RowBarrier):
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _distance_rows(positions, 1, self.segment_length, self.name, 1.0)
+        return self._rows(positions, self.segment_length)
 
 
 @dataclass(frozen=True)
-class EnhancedConnectivity(RowBarrier):
+class EnhancedConnectivity(_DistanceBarrier):
     """No two nodes with one between them are farther apart than two rest lengths.
 
         h_enh,i = ((2 D)^2 - |x_i - x_{i-2}|^2) / 2,    i = 2 ... n
@@ -73,16 +112,16 @@ class EnhancedConnectivity(RowBarrier):
         segment_length: D, in the unit of the positions.
     """
 
-    name = ENHANCED_CONNECTIVITY
+    name, apart = ENHANCED_CONNECTIVITY, 2
     segment_length: float
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n - 1 rows at positions of shape (n + 1, d)."""
-        return _distance_rows(positions, 2, 2.0 * self.segment_length, self.name, 1.0)
+        return self._rows(positions, 2.0 * self.segment_length)
 
 
 @dataclass(frozen=True)
-class Compression(RowBarrier):
+class Compression(_DistanceBarrier):
     """No segment is shorter than its rest length.
 
         h_cmp,i = (|x_i - x_{i-1}|^2 - D_i^2) / 2,    i = 1 ... n
@@ -97,28 +136,35 @@ class Compression(RowBarrier):
         segment_length: D_i, of all segments or of each, shape (n,), in the unit of the positions.
     """
 
-    name = COMPRESSION
-    segment_length: float | NDArray[np.float64]
+    name, sign = COMPRESSION, -1.0
+    segment_length: float | Vector
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n rows at positions of shape (n + 1, d)."""
-        return _distance_rows(positions, 1, self.segment_length, self.name, -1.0)
+        return self._rows(positions, self.segment_length)
 
 
-def _distance_rows(
-    positions: Points, apart: int, max_distance: float | NDArray[np.float64], name: str, sign: float
-) -> BarrierRows:
-    """Return the rows h_i = sign (max_distance_i^2 - |x_{i + apart} - x_i|^2) / 2."""
-    along, first = positions[apart:] - positions[:-apart], np.arange(len(positions) - apart)
-    square = np.einsum("id,id->i", along, along)
-    return BarrierRows(
-        name=name,
-        nodes=np.column_stack([first, first + apart]),
-        obstacle=np.full(len(first), NO_OBSTACLE),
-        value=0.5 * sign * (np.square(max_distance) - square),
-        gradient=sign * np.stack([along, -along], axis=1),
-        clearance=sign * (max_distance - np.sqrt(square)),
-    )
+@compiled_uncounted
+def link_margins(rod: RodProperties, points: Points, heading: Points, work: Points, rows: Table) -> None:
+    """Write value and clearance of connectivity, then of compression, and the chords that the segments keep.
+
+    Args:
+        rod: the thread.
+        points: nodes, shape (n + 1, d) [m].
+        heading: unit vector along the needle, shape (d,).
+        work: memory, shape (n + 1, d).
+        rows: written, shape (5, n) [m^2], [m], [m^2], [m], [m].
+    """
+    for i in range(len(points)):
+        for a in range(points.shape[1]):
+            work[i, a] = points[i, a] / rod.unit
+    chord_lengths(work, heading, rod.clamped, rows[4])
+    for i in range(len(points) - 1):
+        chord = rows[4, i] * rod.unit
+        stretched, length = distance_row(points, i, i + 1, rod.unit)
+        pressed, _ = distance_row(points, i, i + 1, chord)
+        rows[0, i], rows[1, i] = stretched, rod.unit - length
+        rows[2, i], rows[3, i], rows[4, i] = -pressed, length - chord, chord
 
 
 @dataclass(frozen=True)
@@ -156,77 +202,66 @@ class SolidRows(NamedTuple):
 
     node: NDArray[np.uint32]
     obstacle: NDArray[np.int32]
-    value: NDArray[np.float64]
-    clearance: NDArray[np.float64]
+    value: Vector
+    clearance: Vector
     normal: Points
 
     @classmethod
     def room(cls, count: int, dimension: int) -> SolidRows:
         """Return arrays for a number of rows."""
-        value, clearance = np.empty((2, count))
-        return cls(
-            np.empty(count, np.uint32), np.empty(count, np.int32), value, clearance, np.empty((count, dimension))
-        )
+        indices, (value, clearance) = (np.empty(count, np.uint32), np.empty(count, np.int32)), np.empty((2, count))
+        return cls(*indices, value, clearance, np.empty((count, dimension)))
 
 
 @compiled_uncounted
 def solid_rows(
-    points: Points, around: WorkspaceData, radius: float, contacts: Contacts, rows: SolidRows
+    points: Points, around: WorkspaceData, radius: float, nearby: Indices, rows: SolidRows
 ) -> tuple[int, int]:
-    """Write the row of each node and each obstacle that is near, then of each node and the wall.
+    """Write the row of each node and each obstacle within reach, then of each node and the wall.
 
     Args:
         points: nodes, shape (n + 1, d) [m].
         around: obstacles and wall.
         radius: of the thread [m].
-        contacts: memory.
-        rows: written; with as much room.
+        nearby: block of each shape that is near the last node, as a guess for the next, shape (o,).
+        rows: written; with room for a row of each node and each obstacle, and of each node and the wall.
 
     Returns:
-        The number of rows, and of those of obstacles; -1 and 0 when there is no room for all contacts.
+        The number of rows, and of those of obstacles.
     """
-    found = find_contacts(points, around, contacts)
-    written, obstacles = 0, 0
+    discs, boxes, reach, count, obstacles = len(around.discs), around.boxes, around.reach, 0, 0
     for kind in range(2):
-        for c in range(found):
-            i, o = contacts.node[c], contacts.obstacle[c]
-            if contacts.nearest[c] and (o == DISH_WALL) == (kind == 1):
-                least = half_segment_distance(points, i, o, contacts.distance[c], around)
-                rows.node[written], rows.obstacle[written] = i, o
-                rows.value[written], rows.clearance[written] = contacts.distance[c] - radius, least - radius
-                for a in range(points.shape[1]):
-                    rows.normal[written, a] = contacts.normal[c, a]
-                written += 1
+        for i in range(len(points)):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2] if points.shape[1] == 3 else 0.0
+            for o in range(len(around.order) if kind == 0 else 1):
+                s, obstacle, nz = around.order[o] if kind == 0 else 0, o if kind == 0 else DISH_WALL, 0.0
+                if kind == 1:
+                    distance, nx, ny = wall_contact(x, y, around.wall_radius)
+                elif s < discs:
+                    nx, ny, nz = x - around.discs[s, 0], y - around.discs[s, 1], z - around.discs[s, 3]
+                    away = math.sqrt(nx * nx + ny * ny + nz * nz)
+                    distance = away - around.discs[s, 2]
+                    nx, ny, nz = (nx / away, ny / away, nz / away) if away > 0.0 else (1.0, 0.0, 0.0)
+                elif (
+                    boxes[s - discs, 0] - reach <= x <= boxes[s - discs, 2] + reach
+                    and boxes[s - discs, 1] - reach <= y <= boxes[s - discs, 3] + reach
+                ):
+                    nearest = nearest_edge(x, y, s - discs, nearby[o], around)
+                    distance, nx, ny, nearby[o] = nearest.signed, nearest.x, nearest.y, nearest.block
+                else:
+                    continue
+                if not (distance <= reach):
+                    continue
+                least = half_segment_distance(points, i, obstacle, distance, around)
+                rows.node[count], rows.obstacle[count] = i, obstacle
+                rows.value[count], rows.clearance[count] = distance - radius, least - radius
+                rows.normal[count, 0], rows.normal[count, 1] = nx, ny
+                if points.shape[1] == 3:
+                    rows.normal[count, 2] = nz
+                count += 1
         if kind == 0:
-            obstacles = written
-    return (written, obstacles) if found >= 0 else (-1, 0)
-
-
-@compiled_uncounted
-def segment_rows_of(
-    rod: RodProperties, points: Points, heading: Points, work: Points, rows: NDArray[np.float64]
-) -> None:
-    """Write value and clearance of the rows of connectivity, then of compression, and the chords they keep.
-
-    Args:
-        rod: the thread.
-        points: nodes, shape (n + 1, d) [m].
-        heading: unit vector along the needle, shape (d,).
-        work: memory, shape (n + 1, d).
-        rows: written, shape (5, n) [m^2], [m], [m^2], [m], [m].
-    """
-    chords = rows[4]
-    for i in range(len(points)):
-        for a in range(points.shape[1]):
-            work[i, a] = points[i, a] / rod.unit
-    chord_lengths(work, heading, rod.clamped, chords)
-    for i in range(len(chords)):
-        square = 0.0
-        for a in range(points.shape[1]):
-            square += (points[i + 1, a] - points[i, a]) ** 2
-        length, chords[i] = math.sqrt(square), chords[i] * rod.unit
-        rows[0, i], rows[1, i] = 0.5 * (rod.unit * rod.unit - square), rod.unit - length
-        rows[2, i], rows[3, i] = 0.5 * (square - chords[i] * chords[i]), length - chords[i]
+            obstacles = count
+    return count, obstacles
 
 
 @dataclass(frozen=True)
@@ -334,3 +369,186 @@ class Stiffness(RowBarrier):
             gradient=np.stack([slope, -slope], axis=1),
             clearance=-np.abs(np.sqrt(square) - self.rest_distance),
         )
+
+
+REACH = 0.5  # segments; what is farther from touching than this has no row
+
+
+@compiled
+def _crosses(points: Points, i: int, j: int) -> bool:
+    """Return whether the segments from nodes i and j on cross; one that does not exist crosses nothing."""
+    if i < 0 or j < 0 or i + 1 >= len(points) or j + 1 >= len(points) or abs(i - j) < 2:
+        return False
+    ax, ay = points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]
+    bx, by = points[j + 1, 0] - points[j, 0], points[j + 1, 1] - points[j, 1]
+    cx, cy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+    first, second = ax * cy - ay * cx, ax * (cy + by) - ay * (cx + bx)
+    third, fourth = by * cx - bx * cy, by * (cx - ax) - bx * (cy - ay)
+    return bool(first * second < 0.0 and third * fourth < 0.0)
+
+
+@compiled
+def _passes(before: Points, after: Points, node: int, j: int) -> int:
+    """Return how often a node passes through segment j while both move on straight lines: 0, 1 or 2 times.
+
+    With e the segment and r the node from the segment's first node, it does so where e x r = 0, a quadratic equation
+    in time, and 0 <= r . e <= e . e.
+    """
+    ex, ey = before[j + 1, 0] - before[j, 0], before[j + 1, 1] - before[j, 1]
+    rx, ry = before[node, 0] - before[j, 0], before[node, 1] - before[j, 1]
+    fx, fy = after[j + 1, 0] - after[j, 0] - ex, after[j + 1, 1] - after[j, 1] - ey
+    gx, gy = after[node, 0] - after[j, 0] - rx, after[node, 1] - after[j, 1] - ry
+    c, b, a = ex * ry - ey * rx, ex * gy - ey * gx + fx * ry - fy * rx, fx * gy - fy * gx
+    square = b * b - 4.0 * a * c
+    if square <= 0.0:
+        return 0
+    root = -0.5 * (b + math.copysign(math.sqrt(square), b))
+    count = 0
+    for time in (c / root if root != 0.0 else np.inf, root / a if a != 0.0 else np.inf):
+        if 0.0 < time <= 1.0:
+            hx, hy = ex + time * fx, ey + time * fy
+            along = (rx + time * gx) * hx + (ry + time * gy) * hy
+            count += 0.0 <= along <= hx * hx + hy * hy
+    return count
+
+
+@compiled
+def find_self_contacts(
+    before: Points,
+    after: Points,
+    diameter: float,
+    segment: float,
+    crossing: bool,
+    nodes: NDArray[np.int64],
+    gradient: NDArray[np.float64],
+    value: NDArray[np.float64],
+) -> tuple[int, int]:
+    """Write the rows of nodes near segments of the same thread, at the end of a straight motion.
+
+    Of two segments that do not cross, the closest places are a node of one and a place s of the other: so a row is
+
+        h = side |x_k - (1 - s) x_j - s x_{j+1}| - diameter
+
+    where side is -1 if the node has passed through the segment during the motion, an odd number of times, and 1 if it
+    is where it was or has gone around an end. Segments that cross already at the beginning may go on, until they do
+    not.
+
+    Args:
+        before: of all nodes, shape (n + 1, 2) [m].
+        after: the same at the end.
+        diameter: of the thread [m].
+        segment: its segments' length [m].
+        crossing: whether segments that cross at the beginning have rows too, as what has passed.
+        nodes: written: j, j + 1 and k of each row, shape (r, 3).
+        gradient: written, derivative by the position of each, shape (r, 3, 2).
+        value: written, h [m], shape (r,).
+
+    Returns:
+        The number of rows, -1 if there is no room; and how many nodes have passed through a segment on the way, those
+        that came back included: they have no row with the side -1, but no thread moves so.
+    """
+    count, passed, last, farthest = 0, 0, len(after) - 1, 0.0
+    for i in range(last + 1):
+        farthest = max(farthest, math.hypot(after[i, 0] - before[i, 0], after[i, 1] - before[i, 1]))
+    # Places of a thread that can touch have half a turn of it on itself between them.
+    reach, apart = diameter + REACH * segment, 0.5 * math.pi * diameter / segment
+    for k in range(last + 1):
+        j = -1
+        while j < last - 1:
+            j += 1
+            distance = math.hypot(after[k, 0] - after[j, 0], after[k, 1] - after[j, 1])
+            skipped = int((distance - reach - 2.0 * farthest) / segment) - 1
+            if skipped > 0:  # nor are the nodes that are fewer segments away
+                j += skipped - 1
+                continue
+            if not min(abs(k - j), abs(k - j - 1)) > apart or k == j or k == j + 1:
+                continue
+            ex, ey = after[j + 1, 0] - after[j, 0], after[j + 1, 1] - after[j, 1]
+            rx, ry = after[k, 0] - after[j, 0], after[k, 1] - after[j, 1]
+            size = math.sqrt(ex * ex + ey * ey)
+            s = (rx * ex + ry * ey) / (size * size)
+            passes = _passes(before, after, k, j)
+            through = passes % 2 == 1
+            crossed = _crosses(before, k, j) or _crosses(before, k - 1, j)
+            if crossed:
+                if not crossing:
+                    continue
+                through = True
+            passed += passes > 0 or through
+            if not through and not (0.0 <= s <= 1.0) and ((s > 1.0 and j < last - 1) or (s < 0.0 and k < j)):
+                continue  # a corner: the next segment's, or the row of the other node
+            s = min(max(s, 0.0), 1.0)
+            px, py = rx - s * ex, ry - s * ey
+            gap = math.sqrt(px * px + py * py)
+            if not through and gap > reach:
+                continue
+            nx, ny = -ey / size, ex / size
+            if through:
+                side = -1.0 if nx * rx + ny * ry > 0.0 else 1.0
+                nx, ny = side * nx, side * ny
+                gap = -abs(nx * px + ny * py)
+            elif gap > 1e-12:
+                nx, ny = px / gap, py / gap
+            if count == len(value):
+                return -1, 0
+            nodes[count, 0], nodes[count, 1], nodes[count, 2] = j, j + 1, k
+            value[count] = gap - diameter
+            for a in range(2):
+                n = nx if a == 0 else ny
+                gradient[count, 0, a], gradient[count, 1, a], gradient[count, 2, a] = -(1.0 - s) * n, -s * n, n
+            count += 1
+    return count, passed
+
+
+class SelfContact(RowBarrier):
+    """Segments of a thread keep its diameter apart, so that it does not pass through itself: h >= 0 in the plane.
+
+    A `ThreadPredictor` takes it where the scene says so, see `Dish.crossing`; a user can pass it as a barrier.
+
+    Args:
+        thread: the thread.
+
+    Raises:
+        ConfigurationError: the thread has no diameter.
+    """
+
+    name = "self_contact"
+
+    def __init__(self, thread: Thread) -> None:
+        if not thread.diameter > 0.0:
+            raise ConfigurationError("thread.diameter", thread.diameter, "above 0 m where the thread touches itself")
+        self._diameter, self._segment = thread.diameter, thread.segment_length
+        # There is room for 32 rows a node.
+        count = 32 * (thread.segments + 1)
+        self._buffers = np.zeros((count, 3), dtype=np.int64), np.zeros((count, 3, 2)), np.zeros(count)
+
+    def rows(self, positions: Points) -> BarrierRows:
+        """Return all rows at positions of shape (n + 1, 2) [m]; those of segments that cross are -diameter or less."""
+        return self._rows(positions, positions, True)[0]
+
+    def rows_after(self, before: Points, positions: Points) -> BarrierRows:
+        """Return all rows at the end of a straight motion; see `find_self_contacts`."""
+        return self._rows(before, positions, False)[0]
+
+    def passed(self, before: Points, positions: Points) -> bool:
+        """Return whether any segment passes through another, even there and back, between two shapes [m]."""
+        return self._rows(before, positions, False)[1] > 0
+
+    def crossings(self, positions: Points) -> list[tuple[int, int]]:
+        """Return the segments that cross, each pair by their first nodes, the lower one first."""
+        last = len(positions) - 1
+        return [(i, j) for i in range(last) for j in range(i + 2, last) if _crosses(positions, i, j)]
+
+    def _rows(self, before: Points, after: Points, crossing: bool) -> tuple[BarrierRows, int]:
+        before, after = np.ascontiguousarray(before), np.ascontiguousarray(after)
+        nodes, gradient, value = self._buffers
+        count, passed = find_self_contacts(
+            before, after, self._diameter, self._segment, crossing, nodes, gradient, value
+        )
+        if count < 0:
+            words = f"more than {len(value)} places where the thread may touch itself"
+            raise SolverError(self.name, words, math.inf, 0.0)
+        values, free = value[:count].copy(), np.full(count, NO_OBSTACLE, dtype=np.intp)
+        # h is a distance between places that move by the gradient's own norm or less, so it is the clearance too.
+        rows = BarrierRows(self.name, nodes[:count].copy(), free, values, gradient[:count].copy(), values)
+        return rows, passed

@@ -22,24 +22,23 @@ import math
 import numpy as np
 
 from magnetosuture_thread.geometry.chords import find_chord_contacts
-from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     BEFORE,
+    CONTACT,
     GRIPS,
     NO_SHAPE,
     SPAN,
     START,
     GripBuffers,
-    Mask,
     RodBuffers,
     StepBuffers,
     Vector,
 )
 
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
-CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
 FRICTION_COMPLIANCE = 1e-7  # as of a segment: far below what can be measured, and exact at once for the solver
 
 
@@ -50,7 +49,6 @@ def contact_rows(
     workspace: WorkspaceData,
     about: Points,
     start: Points,
-    known: Mask,
     interval: float,
     unit: float,
     radius: float,
@@ -67,7 +65,6 @@ def contact_rows(
         workspace: obstacles and wall [m].
         about: y, shape (n + 1, d) [D].
         start: x, shape (n + 1, d) [D].
-        known: nodes that have no rows, as nothing can push them, shape (n + 1,).
         interval: dt [s].
         unit: D [m].
         radius: rho [m].
@@ -81,7 +78,8 @@ def contact_rows(
     # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
     node, obstacle, place = contacts.node, contacts.obstacle, contacts.place
     distance, normal = contacts.distance, contacts.normal
-    gradient, lower, upper, push = buffers.gradient, buffers.lower, buffers.upper, buffers.push
+    gradient, lower, upper, push, known = buffers.gradient, buffers.lower, buffers.upper, buffers.push, buffers.known
+    first, compliance, limit, multipliers = buffers.first, buffers.compliance, buffers.limit, buffers.multipliers
     for i in range(nodes):
         minimum[i, 0] = minimum[i, 1] = np.inf
         for a in range(dimension):
@@ -93,7 +91,7 @@ def contact_rows(
         clearances[node[c]] = min(clearances[node[c]], distance[c])
     if found > 0 and chords:
         found = find_chord_contacts(points, workspace, unit, radius, clearances, found, contacts)
-    if found < 0 or row + found > len(buffers.first):
+    if found < 0 or row + found > len(first):
         return -1, 0.0
     kept, depth = 0, 0.0
     for c in range(found):
@@ -113,12 +111,12 @@ def contact_rows(
                 bound -= gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
             if known[begin + k]:
                 gradient[here, k] = 0.0
-        buffers.first[here] = begin
+        first[here] = begin
         lower[here], upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else, as a chord may by its ends, that lie on
         # both sides of a shape: then as far as it goes.
-        buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
-        buffers.limit[here] = np.inf
+        compliance[here] = 1e-7 if bound > 0.0 or s > 0.0 else 0.0
+        limit[here] = np.inf
         node[kept], obstacle[kept], place[kept] = i, obstacle[c], s
         distance[kept] = distance[c]
         for a in range(dimension):
@@ -128,19 +126,13 @@ def contact_rows(
     for c in range(kept):
         kind, i = 0 if place[c] == 0.0 else 1, node[c]
         pushes = distance[c] - radius <= max(minimum[i, kind], DEPTH_TOLERANCE)
-        buffers.multipliers[row + c] = push[kind, i] if pushes else 0.0
+        multipliers[row + c] = push[kind, i] if pushes else 0.0
     return kept, depth
 
 
-@compiled_uncounted
+@compiled_inner
 def stays_clear(
-    buffers: StepBuffers,
-    workspace: WorkspaceData,
-    before: Points,
-    about: Points,
-    known: Mask,
-    unit: float,
-    radius: float,
+    buffers: StepBuffers, workspace: WorkspaceData, before: Points, about: Points, unit: float, radius: float
 ) -> bool:
     """Return whether no contact is deeper than `DEPTH_TOLERANCE`, once nodes have moved since rows were written.
 
@@ -152,11 +144,10 @@ def stays_clear(
         workspace: obstacles and wall [m].
         before: where rows were written, shape (n + 1, d) [D].
         about: where the nodes are, shape (n + 1, d) [D].
-        known: nodes that have no rows, shape (n + 1,).
         unit: D [m].
         radius: rho [m].
     """
-    points, clearance, minimum = buffers.work[0], buffers.clearance, radius - DEPTH_TOLERANCE
+    points, clearance, minimum, known = buffers.work[0], buffers.clearance, radius - DEPTH_TOLERANCE, buffers.known
     for i in range(len(about)):
         for a in range(about.shape[1]):
             points[i, a] = about[i, a] * unit
@@ -189,16 +180,17 @@ def keep_pushes(buffers: RodBuffers, rows: int, row: int) -> None:
         rows: of the program.
         row: the first row of the contacts.
     """
-    program, contacts, force = buffers.program, buffers.program.contacts, buffers.contact_force
+    program, contacts, force = buffers.program, buffers.program.contacts, buffers.end[CONTACT]
+    first, gradient, multipliers, push = program.first, program.gradient, program.multipliers, program.push
     force[:] = 0.0
-    program.push[:] = 0.0
+    push[:] = 0.0
     for r in range(row, rows):
         if program.limit[r] == np.inf:
             node, kind = contacts.node[r - row], 0 if contacts.place[r - row] == 0.0 else 1
-            program.push[kind, node] = max(program.push[kind, node], program.multipliers[r])
+            push[kind, node] = max(push[kind, node], multipliers[r])
         for k in range(SPAN):
             for a in range(force.shape[1]):
-                force[program.first[r] + k, a] += program.gradient[r, k, a] * program.multipliers[r]
+                force[first[r] + k, a] += gradient[r, k, a] * multipliers[r]
 
 
 @compiled_uncounted
@@ -225,10 +217,11 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
         The number of rows, -1 if there is no room for them; and by how much the limits differ from those of the last
         solve, over the greatest of them.
     """
-    buffers, grips, known, contacts = rod.program, rod.grips, rod.known, rod.program.contacts
+    buffers, grips, known, contacts = rod.program, rod.grips, rod.program.known, rod.program.contacts
     best, before, start = grips.contact, rod.motion[BEFORE], rod.motion[START]
     shapes, forces, gradient, lower, upper = grips.shape, grips.force, buffers.gradient, buffers.lower, buffers.upper
     node, obstacle, place, normal = contacts.node, contacts.obstacle, contacts.place, contacts.normal
+    first, compliance, limits, multipliers = buffers.first, buffers.compliance, buffers.limit, buffers.multipliers
     nodes = len(known)
     best[:] = -1
     for c in range(count):
@@ -265,10 +258,10 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
                         moved += x * (start[k, 0] - before[k, 0]) + y * (start[k, 1] - before[k, 1])
                     else:
                         gradient[here, k - begin, 0], gradient[here, k - begin, 1] = x, y
-                buffers.first[here] = begin
+                first[here] = begin
                 lower[here] = upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
-                buffers.compliance[here], buffers.limit[here] = FRICTION_COMPLIANCE, limit
-                buffers.multipliers[here] = max(min(grip[2], limit), -limit)
+                compliance[here], limits[here] = FRICTION_COMPLIANCE, limit
+                multipliers[here] = max(min(grip[2], limit), -limit)
                 node[at], obstacle[at], place[at] = i, shape, place[c]
                 written += 1
     return written, change / greatest if greatest > 0.0 else 0.0
@@ -287,31 +280,32 @@ def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, fr
         row: the first row of the contacts.
         friction: coefficients of the wall, then of each shape.
     """
-    contacts, multipliers = buffers.contacts, buffers.multipliers
-    grips.force[:] = 0.0
+    contacts, multipliers, limits = buffers.contacts, buffers.multipliers, buffers.limit
+    shapes, forces = grips.shape, grips.force
+    forces[:] = 0.0
     for r in range(row, rows):
         i, shape, place = contacts.node[r - row], contacts.obstacle[r - row], contacts.place[r - row]
         kind = 0 if place == 0.0 else 1
         slot = _slot_of(grips, kind, i, shape)
-        if buffers.limit[r] < np.inf:
-            grips.force[kind, i, slot, 2] = multipliers[r]
-            grips.force[kind, i, slot, 3] = buffers.limit[r]
-            grips.force[kind, i, slot, 4] = place
+        if limits[r] < np.inf:
+            forces[kind, i, slot, 2] = multipliers[r]
+            forces[kind, i, slot, 3] = limits[r]
+            forces[kind, i, slot, 4] = place
             continue
         if not (multipliers[r] > 0.0 and friction[shape + 1] > 0.0):
             continue
         if slot < 0:
             slot = _slot_of(grips, kind, i, NO_SHAPE)
         if slot >= 0:
-            grips.shape[kind, i, slot] = shape
+            shapes[kind, i, slot] = shape
             for a in range(2):
-                grips.force[kind, i, slot, a] += multipliers[r] * contacts.normal[r - row, a]
+                forces[kind, i, slot, a] += multipliers[r] * contacts.normal[r - row, a]
     for kind in range(2):
-        for i in range(grips.force.shape[1]):
+        for i in range(forces.shape[1]):
             for slot in range(GRIPS):
-                if grips.force[kind, i, slot, 0] == 0.0 and grips.force[kind, i, slot, 1] == 0.0:
-                    grips.shape[kind, i, slot] = NO_SHAPE
-                    grips.force[kind, i, slot] = 0.0
+                if forces[kind, i, slot, 0] == 0.0 and forces[kind, i, slot, 1] == 0.0:
+                    shapes[kind, i, slot] = NO_SHAPE
+                    forces[kind, i, slot] = 0.0
 
 
 @compiled_inline

@@ -76,9 +76,9 @@ def _nothing() -> NDArray[np.float64]:
     return constant_column(0.0, 0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class BarrierMargins:
-    """The margins of one barrier, an entry for each of its rows.
+    """The margins of one barrier, an entry for each of its rows. Not to be written to.
 
     Attributes:
         barrier: its name.
@@ -104,7 +104,7 @@ class BarrierMargins:
     def __post_init__(self) -> None:
         """Take no bound as one that is not known."""
         if len(self.bound) != len(self.clearance):
-            object.__setattr__(self, "bound", constant_column(-math.inf, len(self.clearance)))
+            self.bound = constant_column(-math.inf, len(self.clearance))
 
     @classmethod
     def from_rows(cls, rows: BarrierRows) -> BarrierMargins:
@@ -184,12 +184,7 @@ class Margins(Mapping[str, BarrierMargins]):
         return replace(self, friction=friction)
 
     @classmethod
-    def of(
-        cls,
-        barriers: Sequence[BarrierMargins],
-        contact_tolerance: float,
-        scene_version: str = "",
-    ) -> Margins:
+    def of(cls, barriers: Sequence[BarrierMargins], contact_tolerance: float, scene_version: str = "") -> Margins:
         """Return the margins of barriers at the same positions.
 
         Args:
@@ -198,10 +193,11 @@ class Margins(Mapping[str, BarrierMargins]):
                 close [m].
             scene_version: of the scene.
         """
-        solids = (margins for margins in barriers if len(margins) and margins.barrier in SOLID)
-        near = [margins.node[margins.clearance <= contact_tolerance].tolist() for margins in solids]
-        in_contact = tuple(sorted(set().union(*near))) if near else ()
-        return cls(tuple(barriers), in_contact, scene_version=scene_version)
+        nodes = set[int]()
+        for margins in barriers:
+            if len(margins.value) and margins.barrier in SOLID:
+                nodes.update(margins.node[margins.clearance <= contact_tolerance].tolist())
+        return cls(tuple(barriers), tuple(sorted(nodes)), scene_version=scene_version)
 
 
 def _row(margins: BarrierMargins, row: int) -> BarrierMargins:

@@ -40,14 +40,8 @@ from magnetosuture_thread.thread.barriers import (
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
-from magnetosuture_thread.thread.program import SPAN, Mask, Solver, first_rows
-from magnetosuture_thread.thread.step import (
-    AddedRows,
-    Formulation,
-    PrescribedMotion,
-    StepResult,
-    ThreadState,
-)
+from magnetosuture_thread.thread.program import SPAN, Solver, Table, first_rows
+from magnetosuture_thread.thread.step import AddedRows, Formulation, PrescribedMotion, StepResult, ThreadState
 
 MAX_ELONGATION = 1.5  # of the thread; slacks that give way by more hold nothing together, whatever the residuals say
 
@@ -109,7 +103,8 @@ class PaperFormulation(Formulation):
             gain=min(options.gain, 1.0 / interval), stiffness_gain=min(options.stiffness_gain, 1.0 / interval)
         )
         before, velocities = np.ascontiguousarray(state.positions / unit), state.velocities / unit
-        moved, known, nodes = before.copy(), np.zeros(len(before), np.bool_), list(drive.nodes)
+        moved, known, nodes = before.copy(), buffers.known, list(drive.nodes)
+        known[:] = False
         known[nodes] = True
         moved[nodes] = drive.arrays()[1] / unit
         start = moved if options.lead_ahead else before
@@ -118,12 +113,12 @@ class PaperFormulation(Formulation):
         buffers.blocks[:], buffers.couplings[:] = np.eye(self.dimension), 0.0  # P = I, q = -kappa v
         buffers.linear[:] = -options.damping * velocities
         self._write_barriers(start, options)
-        contacts, before_depth = self._write_obstacles(start, known, options.gain)
+        contacts, before_depth = self._write_obstacles(start, options.gain)
         added: AddedRows | None = None
         if self.added:
             self.added.begin(state.positions, drive, interval)
             added = self.added.linearised(start, moved, known, interval)
-        solution = self._solve(first_rows(buffers, known, self._rows + contacts), velocities, added)
+        solution = self._solve(first_rows(buffers, self._rows + contacts), velocities, added)
         rows = self._rows + contacts
         buffers.multipliers[:rows], buffers.push[:] = solution.multipliers[:rows], 0.0
         np.maximum.at(buffers.push[0], buffers.contacts.node[:contacts], buffers.multipliers[self._rows : rows])
@@ -161,11 +156,11 @@ class PaperFormulation(Formulation):
             buffers.compliance[part] = compliance
             row = part.stop
 
-    def _write_obstacles(self, start: Points, known: Mask, gain: float) -> tuple[int, float]:
+    def _write_obstacles(self, start: Points, gain: float) -> tuple[int, float]:
         """Write the rows of obstacles and wall; return how many there are, and the greatest depth of a node [m]."""
         unit, radius, buffers, first = self._thread.segment_length, self._radius, self._program, self._rows
         workspace = self.workspace.data
-        contacts, depth = contact_rows(buffers, first, workspace, start, start, known, 1.0 / gain, unit, radius, False)
+        contacts, depth = contact_rows(buffers, first, workspace, start, start, 1.0 / gain, unit, radius, False)
         if contacts < 0:
             self._refuse_contacts()
         for row in range(first, first + contacts):
@@ -175,7 +170,7 @@ class PaperFormulation(Formulation):
                 buffers.lower[row] = -gain * squared_barrier(signed, radius / unit) / signed
         return contacts, depth
 
-    def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
+    def segment_margins(self, positions: Points, heading: Points, links: Table | None = None) -> list[BarrierMargins]:
         """Return connectivities and stiffness; see `Formulation`. There is none of compression in this formulation.
 
         Connectivity may give way, as the paper's has slack; what is left of it is what the margins say.

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.polyline import Points, as_numbers
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.mechanics import ThreadForces
 
 MAX_COORDINATE = 1.0  # m; nothing that a dish could hold is farther away
-TIME, DEVIATION = Quantity("", "s"), Quantity("", minimum=0.0)
+TIME = Quantity("", "s")
 STARTED = "started"  # status of a prediction that no step led to
 
 
@@ -142,10 +142,10 @@ def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int =
         expected = f"finite coordinates, at most {reach:g} m from the dish's centre"
         raise InvalidInputError("needle pose position", tail, expected + Quantity("", "m", -reach, reach).hint(tail))
     try:
-        deviations = [float(deviation) for deviation in pose.deviation]
+        first, second = map(float, pose.deviation)
     except (TypeError, ValueError):
-        deviations = []
-    if len(deviations) != 2 or not all(0.0 <= deviation < math.inf for deviation in deviations):
+        first = second = math.nan
+    if not (0.0 <= first < math.inf and 0.0 <= second < math.inf):
         raise InvalidInputError("needle pose deviation", pose.deviation, "two finite numbers, not negative")
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")

@@ -15,19 +15,18 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside, finite_array
 from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.settings.configuration import Quantity, bounded, checked_arguments
-from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.thread.forces import ThreadForces
-from magnetosuture_thread.thread.margins import BarrierMargins, Margins
+from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
+from magnetosuture_thread.thread.barriers import SelfContact
+from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene
+from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
-from magnetosuture_thread.thread.program import SOLVED, Solver
+from magnetosuture_thread.thread.program import SOLVED, Indices
 from magnetosuture_thread.thread.rod import RodFormulation
-from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import make_solver
 from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState, WarmStart
 
-DISH_MARGIN = 0.02  # m; a long needle that reaches over the wall, and what a camera sees above it
 LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
 START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
@@ -36,28 +35,6 @@ MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
 
 FORMULATIONS = (RodFormulation.name, PaperFormulation.name)
-
-
-def make_formulation(
-    name: str,
-    thread: Thread,
-    workspace: Workspace,
-    solver: Solver,
-    tolerance: float,
-    paper: PaperOptions | None = None,
-    barriers: Sequence[Barrier] = (),
-) -> Formulation:
-    """Return a formulation by name; the options are those of `paper`.
-
-    Raises:
-        ConfigurationError: there is no formulation of this name, or barriers cannot be told apart.
-    """
-    check_barriers(tuple(barriers))
-    if name == PaperFormulation.name:
-        return PaperFormulation(thread, workspace, solver, tolerance, paper, barriers)
-    if name != RodFormulation.name:
-        raise ConfigurationError("formulation", name, f"one of {', '.join(FORMULATIONS)}")
-    return RodFormulation(thread, workspace, solver, tolerance, barriers)
 
 
 @checked_arguments("thread predictor")
@@ -143,25 +120,25 @@ class ThreadPredictor:
             check_scene(thread, scene)
             # Margins are of the thread's surface, and of the half segments beside a node.
             reach = chosen.margin_range + 0.5 * (thread.diameter + thread.segment_length)
-            workspace = Workspace(
-                scene.obstacles,
-                reach,
-                wall_radius=scene.dish.radius,
-                friction=scene.friction,
-                wall_friction=scene.dish.wall_friction,
-            )
+            friction = scene.friction, scene.dish.wall_friction
+            workspace = Workspace(scene.obstacles, reach, 2, scene.dish.radius, *friction)
             self.scene_version = scene.version
             if formulation == RodFormulation.name and scene.dish.has_self_contact(thread.diameter):
                 barriers = (*barriers, SelfContact(thread))
         if isinstance(formulation, str):
+            Quantity("", choices=FORMULATIONS).checked("formulation", formulation, str)
+            check_barriers(tuple(barriers))
             tolerance = chosen.residual_tolerance
-            solves = make_solver(solver, tolerance)
-            formulation = make_formulation(formulation, thread, workspace, solves, tolerance, paper, barriers)
+            parts = thread, workspace, make_solver(solver, tolerance), tolerance
+            is_rod = formulation == RodFormulation.name
+            formulation = RodFormulation(*parts, barriers) if is_rod else PaperFormulation(*parts, paper, barriers)
         self.thread, self.formulation, self.contact_tolerance = thread, formulation, chosen.contact_tolerance
         self.added = formulation.added
         self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
+        self._nodes = np.array([0, *self.fixed_nodes], np.int64)
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
-        self.reach = min(workspace.wall_radius + DISH_MARGIN, MAX_COORDINATE)
+        # A long needle reaches over the wall by up to 2 cm, and a camera sees what is above it.
+        self.reach = min(workspace.wall_radius + 0.02, MAX_COORDINATE)
         far, self._shape = self.reach + thread.length, (None, formulation.dimension)
         self._limits = bounded("m", -far, far)
         self.pose: NeedlePose | None = None
@@ -197,13 +174,9 @@ class ThreadPredictor:
         """
         Quantity("", choices=tuple(MATERIALS)).checked("material", material, str)
         Quantity("", choices=tuple(kind.value for kind in Attachment)).checked("attachment", attachment, str)
-        thread = Thread.of(
-            MATERIALS[material],
-            length=length,
-            segments=segments,
-            attachment=Attachment(attachment),
-            viscosity=viscosity,
-        )
+        kind = Attachment(attachment)
+        of = MATERIALS[material]
+        thread = Thread.of(of, length=length, segments=segments, attachment=kind, viscosity=viscosity)
         return cls(thread, scene, barriers, **options)
 
     @property
@@ -288,7 +261,7 @@ class ThreadPredictor:
         self.added.first_time = min(self.added.first_time, pose.stamp)
         self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
         self.pose = pose
-        return self._prediction(pose, 0.0, (), {})
+        return self._prediction(pose)
 
     def follow_on(self, other: ThreadPredictor) -> None:
         """Continue from the state of another predictor, if it has started."""
@@ -319,28 +292,42 @@ class ThreadPredictor:
         interval = pose.stamp - last.stamp
         if interval <= 0.0:
             raise InvalidInputError("needle pose stamp", f"{pose.stamp:.6f} s", f"later than {last.stamp:.6f} s")
-        ends = {0: pose.tail, **{node: state.positions[node] for node in self.fixed_nodes}}
-        for node, position in (prescribed or {}).items():
-            _check_node("node of prescribed motion", node, self.thread)
-            ends[node] = finite_array(f"position of node {node}", position, self._shape[1:], self._limits)
-        nodes = tuple(ends)
-        begin, end = state.positions[list(nodes)], np.array(list(ends.values()))
+        nodes, begin, end = self._prescribed(pose, state, prescribed)
         way = max(map(math.dist, begin.tolist(), end.tolist()))
         substeps = self.options.substeps(interval, way / self.thread.segment_length)
 
         def drive(part: float) -> PrescribedMotion:
-            heading = (1.0 - part) * last.heading + part * pose.heading
+            heading, ends = pose.heading, end
+            if part < 1.0:
+                ends = begin + part * (end - begin)
+                heading = (1.0 - part) * last.heading + part * pose.heading
             size = math.hypot(*heading.tolist())  # 0 between opposite headings
             heading = heading / size if size > 1e-6 else pose.heading
-            return PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval)
+            return PrescribedMotion(nodes, ends, heading, last.stamp + part * interval)
 
         results = list[StepResult]()
         for index in range(1, substeps + 1):
             results += self._follow(state, drive, index / substeps, interval / substeps, interval)
             state = results[-1].state
         self.pose, self.state = pose, state
-        velocities = dict(zip(nodes, (end - begin) / interval, strict=True)) if pose.motion is not None else {}
+        velocities = None if pose.motion is None else dict(zip(nodes.tolist(), (end - begin) / interval, strict=True))
         return self._prediction(pose, interval, results, velocities)
+
+    def _prescribed(
+        self, pose: NeedlePose, state: ThreadState, prescribed: Mapping[int, Points] | None
+    ) -> tuple[Indices, Points, Points]:
+        """Return the nodes of prescribed motion, the needle's first, where they are, and where at the next pose."""
+        nodes, begin = self._nodes, state.positions[self._nodes]
+        end: Points = begin.copy()
+        end[0] = pose.tail
+        if prescribed:
+            ends = dict(zip(nodes.tolist(), end, strict=True))
+            for node, position in prescribed.items():
+                _check_node("node of prescribed motion", node, self.thread)
+                ends[node] = finite_array(f"position of node {node}", position, self._shape[1:], self._limits)
+            nodes, end = np.array(list(ends), np.int64), np.array(list(ends.values()))
+            begin = state.positions[nodes]
+        return nodes, begin, end
 
     def _follow(
         self,
@@ -378,7 +365,11 @@ class ThreadPredictor:
             return [done]  # no better than it was
 
     def _prediction(
-        self, pose: NeedlePose, interval: float, results: Sequence[StepResult], velocities: Mapping[int, Points]
+        self,
+        pose: NeedlePose,
+        interval: float = 0.0,
+        results: Sequence[StepResult] = (),
+        velocities: Mapping[int, Points] | None = None,
     ) -> Prediction:
         """Return the prediction of the present state.
 
@@ -386,39 +377,40 @@ class ThreadPredictor:
             pose: of the needle.
             interval: since the last one [s].
             results: of the steps that led here; none at the start.
-            velocities: of the nodes of prescribed motion [m/s].
+            velocities: of the nodes of prescribed motion [m/s]; None where the needle's motion is not known.
         """
-        state, formulation = self.state, self.formulation
+        state, formulation, tolerance = self.state, self.formulation, self.contact_tolerance
         assert state is not None
-        positions = state.positions
-        warm_start = formulation.warm_start() if results and pose.motion is not None else None
+        last = results[-1] if results else None
+        # The first that was not solved at once, if there is one, else the last.
+        result = next((done for done in results if done.status != SOLVED), last) if len(results) > 1 else last
+        positions, links = state.positions, last.links if last else None
+        warm_start = formulation.warm_start() if results and velocities is not None else None
         # At once, as barriers may move on before they are asked again.
-        added = [BarrierMargins.from_rows(rows) for rows in self.added.rows_at(pose.stamp, positions, pose.heading)]
+        added = self.added.margins_at(pose.stamp, positions, pose.heading) if self.added else ()
 
         def compute_margins() -> Margins:
-            margins = formulation.margins(positions, pose.heading)
-            return Margins.of([*margins, *added], self.contact_tolerance, self.scene_version)
+            margins = formulation.margins(positions, pose.heading, links)
+            return Margins.of([*margins, *added], tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
-            found = formulation.forces(results[-1], pose.heading) if results else None
-            if found is None or warm_start is None:
-                return found
-            return self._forces_in_motion(state, pose, velocities, warm_start) or found
+            forces = formulation.forces(last, pose.heading) if last else None
+            if forces is None or warm_start is None or velocities is None:
+                return forces
+            return self._forces_in_motion(state, pose, velocities, warm_start) or forces
 
-        # The first that was not solved at once, if there is one, else the last.
-        told = next((done for done in results if done.status != SOLVED), results[-1] if results else None)
         return Prediction(
             stamp=pose.stamp,
             formulation=formulation.name,
             scene_version=self.scene_version,
             positions=positions,
-            strain=formulation.strain(positions, pose.heading),
+            strain=formulation.strain(positions, pose.heading, links),
             interval=interval,
             substeps=len(results),
-            solver=told.solver if told else "none",
-            status=told.status if told else STARTED,
-            residual=max((done.residuals.largest for done in results), default=0.0),
-            converged=all(done.converged for done in results),
+            solver=result.solver if result else "none",
+            status=result.status if result else STARTED,
+            residual=max([done.residuals.largest for done in results], default=0.0),
+            converged=all([done.converged for done in results]),
             compute_margins=compute_margins,
             compute_forces=compute_forces,
         )
@@ -437,7 +429,7 @@ class ThreadPredictor:
         heading = np.array([math.cos(angle), math.sin(angle)])
         velocities = np.array([motion.velocity if node == 0 else prescribed[node] for node in prescribed])
         ends = state.positions[list(prescribed)] + MOTION_TIME * velocities
-        moved = PrescribedMotion(tuple(prescribed), ends, heading, pose.stamp)
+        moved = PrescribedMotion(np.array(list(prescribed)), ends, heading, pose.stamp)
         # After a much shorter step nothing is extrapolated from the last velocities.
         begin = ThreadState(state.positions, state.velocities, 0.1 * MOTION_TIME)
         kept = formulation.warm_start()

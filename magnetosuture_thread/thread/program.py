@@ -14,12 +14,13 @@ with d coordinates a node, all is one band of half-width 3 d.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 
@@ -35,6 +36,9 @@ NO_SHAPE = -2  # in place of a shape
 BEFORE, START, LAST, VELOCITIES, ABOUT, LAST_ABOUT = range(6)
 """Of a step's motion: where the nodes are; the same with the prescribed nodes moved; velocities over the last step; of
 this step, better with each solve; where they lead; where the program was written about."""
+END, END_VELOCITIES, INTERNAL, CONTACT = range(4)
+"""Of a step's end: where the nodes are [m] and their velocities over the step [m/s]; what the segments push each node
+with; and what contacts do, with friction."""
 SOLVED = "solved"  # every solver's word for a solution at the first attempt
 
 
@@ -97,6 +101,7 @@ class StepBuffers(NamedTuple):
     blocks: Table
     couplings: Table
     linear: Points
+    known: Mask
     first: Indices
     gradient: Table
     lower: Vector
@@ -121,6 +126,7 @@ class StepBuffers(NamedTuple):
             np.zeros((nodes, dimension, dimension)),
             np.zeros((SPAN, nodes)),
             np.zeros((nodes, dimension)),
+            np.zeros(nodes, np.bool_),
             np.zeros(total, np.int64),
             np.zeros((total, SPAN, dimension)),
             lower,
@@ -159,44 +165,34 @@ class RodBuffers(NamedTuple):
         program: its programs.
         grips: its friction.
         motion: positions and velocities of the step, see `BEFORE` and what follows it, shape (6, n + 1, d).
-        known: the prescribed nodes, shape (n + 1,).
         drag: the medium's part of `blocks`, shape (n + 1, d, d).
         drag_linear: the medium's part of `linear`, shape (n + 1, d).
-        internal: what the segments push each node with, shape (n + 1, d).
-        contact_force: what contacts push each node with, with friction, shape (n + 1, d).
+        end: positions [m] and velocities [m/s] at the end of the step, and forces, see `END` and what follows it, shape
+            (4, n + 1, d).
         tail_load: what medium and contacts do at the needle's tail, shape (d,).
-        end: positions [m] and velocities [m/s] at the end of the step, shape (2, n + 1, d).
+        links: connectivity and compression at the end of the step, see `link_margins`, shape (5, n).
+        residuals: the largest of each kind over the step's solves, see `Residuals`, shape (3,).
     """
 
     program: StepBuffers
     grips: GripBuffers
     motion: Table
-    known: Mask
     drag: Table
     drag_linear: Points
-    internal: Points
-    contact_force: Points
-    tail_load: Vector
     end: Table
+    tail_load: Vector
+    links: Table
+    residuals: Vector
 
     @classmethod
-    def of(cls, program: StepBuffers, dimension: int) -> RodBuffers:
+    def of(cls, program: StepBuffers) -> RodBuffers:
         """Return buffers for a rod with these programs."""
-        nodes = len(program.linear)
+        nodes, dimension = program.linear.shape
         places = (2, nodes, GRIPS)
-        drag_linear, internal, contact_force = np.zeros((3, nodes, dimension))
-        return cls(
-            program,
-            GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1)),
-            np.zeros((6, nodes, dimension)),
-            np.zeros(nodes, np.bool_),
-            np.zeros((nodes, dimension, dimension)),
-            drag_linear,
-            internal,
-            contact_force,
-            np.zeros(dimension),
-            np.zeros((2, nodes, dimension)),
-        )
+        grips = GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1))
+        shapes = (6, nodes, dimension), (nodes, dimension, dimension), (nodes, dimension)
+        of_end = (4, nodes, dimension), (dimension,), (5, nodes - 1), (3,)
+        return cls(program, grips, *map(np.zeros, (*shapes, *of_end)))
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
@@ -204,19 +200,14 @@ class RodBuffers(NamedTuple):
         program = self.program
         return program.multipliers[: len(program.linear) - 1], program.push, self.grips.shape, self.grips.force
 
-    def restore(self, memory: tuple[NDArray[Any], ...]) -> None:
-        """Restore what another rod's or an earlier `memory` had."""
-        for array, kept in zip(self.memory, memory, strict=True):
-            array[:] = kept
 
-
-def first_rows(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
+def first_rows(buffers: StepBuffers, rows: int) -> ChainProgram:
     """Return the program of the first rows."""
     return ChainProgram(
         buffers.blocks,
         buffers.couplings,
         buffers.linear,
-        known,
+        buffers.known,
         buffers.first[:rows],
         buffers.gradient[:rows],
         buffers.lower[:rows],
@@ -228,9 +219,8 @@ def first_rows(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
     )
 
 
-program_of = compiled(first_rows)
 program_view = compiled_inline(first_rows)
-"""The same for kernels, and for those that do not count references to arrays."""
+"""The same for kernels."""
 
 
 class Residuals(NamedTuple):
@@ -296,7 +286,7 @@ def residuals_of(program: ChainProgram, velocities: Points, multipliers: Vector)
     others; the balance of forces by max(1, its largest force); the complementarity by
     max(1, the largest multiplier).
     """
-    return Residuals(*compiled_residuals(program, velocities, multipliers))
+    return Residuals(*residuals_with(program, velocities, multipliers, np.empty((2, *velocities.shape))))
 
 
 @compiled_inline
@@ -312,27 +302,27 @@ def _pull(program: ChainProgram, r: int, velocities: Points, multiplier: float, 
     return image
 
 
-@compiled
-def compiled_residuals(program: ChainProgram, velocities: Points, multipliers: Vector) -> tuple[float, float, float]:
-    """Return the same, for compiled code: primal, dual, complementarity.
+@compiled_inline
+def _missed(miss: float, push: float, limit: float, scale: float) -> float:
+    """Return what a row with a limit that misses a bound, or does not, adds to the complementarity."""
+    return (limit - push if miss > 0.0 else max(push, 0.0)) * min(abs(miss) / scale, 1.0)
+
+
+@compiled_uncounted
+def residuals_with(
+    program: ChainProgram, velocities: Points, multipliers: Vector, work: Table
+) -> tuple[float, float, float]:
+    """Return the same, for compiled code: primal, dual, complementarity, with memory of shape (2, m, d).
 
     Shares nothing with a solver, so P u is written out here once more.
     """
-    return _residuals(program, velocities, multipliers, np.empty(velocities.shape), np.zeros(velocities.shape))
-
-
-@compiled_inner
-def _residuals(
-    program: ChainProgram, velocities: Points, multipliers: Vector, force: Points, pulled: Points
-) -> tuple[float, float, float]:
-    """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
     nodes, dimension = velocities.shape
     blocks, couplings, linear, known = program.blocks, program.couplings, program.linear, program.known
-    compliance, limit = program.compliance, program.limit
+    compliance, limits, force, pulled = program.compliance, program.limit, work[0], work[1]
     largest = 1.0
     for i in range(nodes):
         for k in range(dimension):
-            value = 0.0
+            value = pulled[i, k] = 0.0
             for j in range(dimension):
                 value += blocks[i, k, j] * velocities[i, j]
             for apart in range(1, SPAN + 1):
@@ -342,36 +332,31 @@ def _residuals(
                     value += couplings[apart - 1, i] * velocities[i + apart, k]
             largest = max(largest, abs(value), abs(linear[i, k]))
             force[i, k] = value + linear[i, k]
-    primal, complementarity, pushed, outside = 0.0, 0.0, 1.0, 0.0
-    finite = True
+    primal, complementarity, pushed, outside, finite = 0.0, 0.0, 1.0, 0.0, True
     for r in range(len(program.lower)):
-        multiplier, scale = multipliers[r], 1.0
-        image = _pull(program, r, velocities, multiplier, pulled)
-        image += compliance[r] * multiplier
-        scale = max(scale, abs(image))
-        lower, upper = program.lower[r], program.upper[r]
-        if np.isfinite(lower):
-            scale = max(scale, abs(lower))
-        if np.isfinite(upper):
-            scale = max(scale, abs(upper))
-        gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
-        if limit[r] < np.inf:
-            outside = max(outside, abs(multiplier) - limit[r])
-            for miss, push in ((lower - image, multiplier), (image - upper, -multiplier)):
-                weight = limit[r] - push if miss > 0.0 else max(push, 0.0)
-                complementarity = max(complementarity, weight * min(abs(miss) / scale, 1.0))
-            gap = 0.0
+        multiplier, lower, upper, limit = multipliers[r], program.lower[r], program.upper[r], limits[r]
+        image = _pull(program, r, velocities, multiplier, pulled) + compliance[r] * multiplier
+        scale = max(1.0, abs(image))
+        scale = max(scale, abs(lower)) if abs(lower) < np.inf else scale
+        scale = max(scale, abs(upper)) if abs(upper) < np.inf else scale
+        if limit < np.inf:
+            outside = max(outside, abs(multiplier) - limit)
+            missed = max(
+                _missed(lower - image, multiplier, limit, scale), _missed(image - upper, -multiplier, limit, scale)
+            )
+            complementarity = max(complementarity, missed)
         else:
             primal = max(primal, (lower - image) / scale, (image - upper) / scale)
-        # A push on a bound that does not exist counts as one from a whole scale away.
-        complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
+            # A push on a bound that does not exist counts as one from a whole scale away.
+            gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
+            complementarity = max(complementarity, abs(multiplier) * min(gap / scale, 1.0))
         pushed = max(pushed, abs(multiplier))
-        finite = finite and np.isfinite(image) and np.isfinite(multiplier)
-        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(limit[r]))
+        finite = finite and abs(image) < np.inf and abs(multiplier) < np.inf
+        finite = finite and not (math.isnan(lower) or math.isnan(upper) or math.isnan(limit))
     dual = 0.0
     for i in range(nodes):
         for k in range(dimension):
-            finite = finite and np.isfinite(force[i, k])
+            finite = finite and abs(force[i, k]) < np.inf
             if not known[i]:
                 largest = max(largest, abs(pulled[i, k]))
                 dual = max(dual, abs(force[i, k] - pulled[i, k]))

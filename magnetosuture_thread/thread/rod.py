@@ -29,6 +29,7 @@ a compliance of 1e-7 instead of slacks, and where the barriers are linearised is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from typing import NamedTuple
@@ -40,7 +41,6 @@ from magnetosuture_thread.geometry.compiled import (
     TypedKernel,
     compiled_inline,
     compiled_inner,
-    compiled_uncounted,
     compiled_uncounted_without_gil,
     compiled_within,
 )
@@ -48,7 +48,7 @@ from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread import banded, mechanics
-from magnetosuture_thread.thread.barriers import move_inside, segment_rows_of
+from magnetosuture_thread.thread.barriers import SelfContact, distance_row, link_margins, move_inside
 from magnetosuture_thread.thread.contact_rows import (
     DEPTH_TOLERANCE,
     contact_rows,
@@ -58,20 +58,28 @@ from magnetosuture_thread.thread.contact_rows import (
     knows_friction,
     stays_clear,
 )
-from magnetosuture_thread.thread.forces import ThreadForces, friction_of, keep_internal_forces, write_forces
 from magnetosuture_thread.thread.margins import BarrierMargins, constant_column
 from magnetosuture_thread.thread.material import Attachment, Thread
-from magnetosuture_thread.thread.mechanics import RodProperties
+from magnetosuture_thread.thread.mechanics import (
+    RodProperties,
+    ThreadForces,
+    friction_of,
+    keep_internal_forces,
+    write_forces,
+)
 from magnetosuture_thread.thread.program import (
     ABOUT,
     BEFORE,
+    CONTACT,
+    END,
+    END_VELOCITIES,
     LAST,
     LAST_ABOUT,
     NO_SHAPE,
     SOLVED,
+    SPAN,
     START,
     VELOCITIES,
-    ChainProgram,
     Indices,
     Mask,
     Residuals,
@@ -80,11 +88,10 @@ from magnetosuture_thread.thread.program import (
     StepBuffers,
     Table,
     Vector,
-    compiled_residuals,
     first_rows,
     program_view,
+    residuals_with,
 )
-from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import BandedSolver, FallbackSolver
 from magnetosuture_thread.thread.step import (
     AddedRows,
@@ -96,9 +103,6 @@ from magnetosuture_thread.thread.step import (
 )
 
 STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
-COMPLIANCE = 1e-7  # of a segment
-FRICTION_TOLERANCE = 0.003  # of the limits of friction; beyond it they are taken from the solve and it is repeated
-MAX_FRICTION_SOLVES = 5  # of a step; then the limits are those of the solve before
 MAX_SOLVES = 8  # of a step
 MAX_STEP_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
 ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
@@ -144,52 +148,218 @@ class StepInput(NamedTuple):
     last_interval: float
 
 
+class StepProgress(NamedTuple):
+    """How far a step has got.
+
+    Attributes:
+        code: `ENDED`; `NO_ROOM` for all contacts in the buffers; or `UNSOLVED`, and then the program is there for
+            another solver.
+        contacts: number of rows of contacts and friction.
+        solves: that the step has had.
+        off: how far off the barriers are over what is allowed, 1 or less if they hold; see `_linearise`.
+        status: the first of the solves that is not 0, see `banded.STATUS`.
+    """
+
+    code: int
+    contacts: int
+    solves: int
+    off: float
+    status: int
+
+
+@compiled_uncounted_without_gil
+def solve_step(
+    model: StepModel,
+    buffers: RodBuffers,
+    solver_buffers: banded.SolverBuffers,
+    step_input: StepInput,
+    solves: int,
+    elsewhere: float,
+    rows: int,
+) -> tuple[int, int, int, float, int]:
+    """Linearise, check and solve until the barriers hold, or the solves are too many, or as far as it gets.
+
+    Args:
+        model: the thread and what is around it.
+        buffers: the step under way; it has the program in the end, its multipliers, and the end of the step.
+        solver_buffers: of the structured solver.
+        step_input: the step.
+        solves: how many this step has had; with none it begins.
+        elsewhere: how far off the rows are that this code does not know, see `_linearise`.
+        rows: of the program in the buffers, whose solution by another solver is there too; 0 for none.
+
+    Returns:
+        The fields of `StepProgress`, which a named tuple would take as long to return as it takes to set up a step.
+    """
+    motion, friction = buffers.motion, model.workspace.friction
+    # Numbers of a type of their own: a function is compiled again for each number that is written out.
+    contacts, status = np.int64(-1), np.int64(banded.SOLVED)
+    if solves == 0:
+        _begin(buffers, step_input, model.rod.unit)
+    last_off = np.inf
+    while True:
+        if rows > 0:
+            _accept(buffers, friction, rows, step_input.interval)
+        contacts, off, rubs = _linearise(model, buffers, step_input, solves, elsewhere, contacts, last_off)
+        last_off = off
+        _copy(motion[ABOUT], motion[LAST_ABOUT])
+        if contacts < 0:
+            return NO_ROOM, contacts, solves, off, status
+        if solves == model.max_solves or (off <= 1.0 and not rubs):
+            _finish(model, buffers, step_input, off)
+            return ENDED, contacts, solves, off, status
+        _write_objective(model.rod, buffers, step_input)
+        rows = len(motion[ABOUT]) - 1 + contacts
+        word = _solve(buffers, solver_buffers, rows, model.tolerance) if model.structured else banded.STALLED
+        if word != banded.SOLVED and word != banded.RESTARTED:
+            return UNSOLVED, contacts, solves, off, status
+        status, solves = status if status != banded.SOLVED else word, solves + 1
+
+
 @compiled_inline
-def copy_points(given: Points, written: Points) -> None:
+def _copy(points: Points, written: Points) -> None:
     """Copy positions or velocities; an assignment of slices would make an array."""
-    for i in range(len(given)):
-        for a in range(given.shape[1]):
-            written[i, a] = given[i, a]
+    for i in range(len(points)):
+        for a in range(points.shape[1]):
+            written[i, a] = points[i, a]
 
 
 @compiled_within
-def assemble_step(
-    solves: int, model: StepModel, buffers: RodBuffers, given: StepInput, elsewhere: float, last_contacts: int
-) -> tuple[int, float, bool]:
-    """Write the program about a predicted end point; where that came from a solve and is exact, do not.
+def _begin(buffers: RodBuffers, step_input: StepInput, unit: float) -> None:
+    """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
-    Where the program in the buffers was written about, and how many contacts it has, -1 if that is not known, make it
-    cheap to find that out.
-
-    Returns the number of rows of contacts and friction, -1 if there is no room for them; how far off the barriers the
-    point is: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or less if it is
-    exact; and whether the limits of friction are still to be found.
+    Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
+    farther than a segment: then the guess is where the thread is.
     """
-    program, motion, known, interval = buffers.program, buffers.motion, buffers.known, given.interval
+    motion, known, interval = buffers.motion, buffers.program.known, step_input.interval
+    nodes, dimension = step_input.positions.shape
+    known[:] = False
+    buffers.residuals[:] = 0.0
+    for i in range(nodes):
+        for a in range(dimension):
+            motion[BEFORE, i, a] = motion[START, i, a] = step_input.positions[i, a] / unit
+            motion[LAST, i, a] = motion[VELOCITIES, i, a] = step_input.velocities[i, a] / unit
+    for k in range(len(step_input.nodes)):
+        known[step_input.nodes[k]] = True
+        for a in range(dimension):
+            motion[START, step_input.nodes[k], a] = step_input.ends[k, a] / unit
+    goes_on = step_input.last_interval > 0.0 and interval <= MAX_STEP_RATIO * step_input.last_interval
+    for i in range(nodes):
+        for a in range(dimension):
+            goes_on = goes_on and (known[i] or abs(interval * motion[LAST, i, a]) <= 1.0)
+    for i in range(nodes):
+        for a in range(dimension):
+            way = interval * motion[LAST, i, a] if goes_on and not known[i] else 0.0
+            motion[ABOUT, i, a] = motion[START, i, a] + way
+
+
+@compiled_within
+def _linearise(
+    model: StepModel,
+    buffers: RodBuffers,
+    step_input: StepInput,
+    solves: int,
+    elsewhere: float,
+    last_contacts: int,
+    last_off: float,
+) -> tuple[int, float, bool]:
+    """Write the rows of all barriers about where the last solve leads, or halfway back where that is no better.
+
+    Solves that swing from side to side, as of a chord that turns about a corner, do not halve how far off the barriers
+    are: the middle is better.
+
+    `last_contacts` and `last_off` are those of the last linearisation; -1 contacts where that is not in the buffers.
+    `elsewhere` is how far off barriers are that this code does not know.
+
+    Returns:
+        The number of rows of contacts and friction, -1 if there is no room for them; how far off the barriers are where
+        the last solve leads: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or
+        less if it is exact; and whether the limits of friction are still to be found.
+    """
+    about, last_about, off, rubs = buffers.motion[ABOUT], buffers.motion[LAST_ABOUT], np.inf, False
+    contacts = last_contacts
+    for attempt in range(2):
+        count = solves if attempt == 0 else np.int64(0)
+        contacts, now_off, now_rubs = _write_rows(model, buffers, step_input, count, elsewhere, contacts)
+        if attempt == 1:
+            break
+        off, rubs = now_off, now_rubs
+        if contacts < 0 or not 1.0 < off < np.inf or off <= 0.5 * last_off or solves >= model.max_solves:
+            break
+        for i in range(len(about)):
+            for a in range(about.shape[1]):
+                about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
+        contacts = np.int64(-1)
+    return contacts, off, rubs
+
+
+@compiled_within
+def _write_rows(
+    model: StepModel, buffers: RodBuffers, step_input: StepInput, solves: int, elsewhere: float, last_contacts: int
+) -> tuple[int, float, bool]:
+    """Write the rows about a predicted end point; where that came from a solve and is exact, leave them.
+
+    Returns:
+        See `_linearise`.
+    """
+    program, motion, interval = buffers.program, buffers.motion, step_input.interval
     about, start = motion[ABOUT], motion[START]
     rod, workspace, segments = model.rod, model.workspace, len(about) - 1
-    mechanics.chord_lengths(about, given.heading, rod.clamped, program.chords)
-    strain = segment_rows(program, about, start, known, interval)
+    mechanics.chord_lengths(about, step_input.heading, rod.clamped, program.chords)
+    strain = segment_rows(program, about, start, interval)
     rough, off = knows_friction(workspace.friction), max(strain / STRAIN_TOLERANCE, elsewhere)
     cheap = solves > 0 and last_contacts >= 0 and not rough and off <= 1.0
-    if cheap and stays_clear(program, workspace, motion[LAST_ABOUT], about, known, rod.unit, rod.radius):
+    if cheap and stays_clear(program, workspace, motion[LAST_ABOUT], about, rod.unit, rod.radius):
         return last_contacts, off, False
-    contacts, depth = contact_rows(
-        program, segments, workspace, about, start, known, interval, rod.unit, rod.radius, True
-    )
+    contacts, depth = contact_rows(program, segments, workspace, about, start, interval, rod.unit, rod.radius, True)
     rubs = False
     if contacts > 0 and rough:
         rubbing, change = friction_rows(buffers, segments, contacts, workspace.friction, interval)
         contacts = contacts + rubbing if rubbing >= 0 else -1
-        rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
-    off = max(off, depth / DEPTH_TOLERANCE)
-    if contacts >= 0 and (solves == 0 or off > 1.0 or rubs):
-        _objective(rod, buffers, given)
-    return contacts, off if solves > 0 else np.inf, rubs
+        # Beyond a share of the limits they are taken from the solve, and it is repeated, up to five times.
+        rubs = change > 0.003 and 0 < solves < 5
+    return contacts, max(off, depth / DEPTH_TOLERANCE) if solves > 0 else np.inf, rubs
 
 
-@compiled_within
-def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> None:
+@compiled_inner
+def segment_rows(buffers: StepBuffers, about: Points, start: Points, interval: float) -> float:
+    """Write the rows of connectivity and compression together; return the largest |h(y)|.
+
+        grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt,    h_i = (D_i^2 - |y_{i+1} - y_i|^2) / 2
+
+    with the chord D_i of each segment.
+    """
+    nodes, dimension = about.shape
+    # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
+    gradient, lower, upper, known, chords = (
+        buffers.gradient,
+        buffers.lower,
+        buffers.upper,
+        buffers.known,
+        buffers.chords,
+    )
+    first, compliance, multipliers, strain = buffers.first, buffers.compliance, buffers.multipliers, 0.0
+    for i in range(nodes - 1):
+        begin, moved = min(i, nodes - 3), 0.0
+        value, _ = distance_row(about, i, i + 1, chords[i])
+        for a in range(dimension):
+            along = about[i + 1, a] - about[i, a]
+            for k in range(SPAN):
+                gradient[i, k, a] = along if begin + k == i else (-along if begin + k == i + 1 else 0.0)
+            moved += along * (start[i, a] - about[i, a] - start[i + 1, a] + about[i + 1, a])
+        bound = (-value - moved) / interval
+        # A compliance as small as that of a contact, below what can be measured.
+        first[i], compliance[i], lower[i], upper[i] = begin, 1e-7, bound, bound
+        if known[i] and known[i + 1]:
+            # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
+            lower[i], upper[i], multipliers[i] = -np.inf, np.inf, 0.0
+        else:
+            strain = max(strain, abs(value))
+    return strain
+
+
+@compiled_inner
+def _write_objective(rod: RodProperties, buffers: RodBuffers, step_input: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
         P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z (v + flow)
@@ -197,44 +367,46 @@ def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> Non
     and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the prescribed nodes, which have
     moved already. In air a = 1, and of Z v only the inertia's part is left; the flow acts on the drag's part alone.
     """
-    program, motion, heading, interval = buffers.program, buffers.motion, given.heading, given.interval
+    program, motion, heading, interval = buffers.program, buffers.motion, step_input.heading, step_input.interval
     before, start, last, about = motion[BEFORE], motion[START], motion[LAST], motion[ABOUT]
     nodes, dimension = start.shape
     blocks, couplings, linear = program.blocks, program.couplings, program.linear
+    drag, drag_linear, weights, bands = buffers.drag, buffers.drag_linear, rod.weights, rod.bands
+    gravity, flow, unit, damping = rod.gravity, rod.flow, rod.unit, rod.bending_damping
     inertia = rod.mass_per_length / interval
     scale = inertia + rod.drag_across
-    rate = rod.bending_stiffness / (scale * rod.unit**4)
+    rate = rod.bending_stiffness / (scale * unit**4)
     inertia = inertia / scale
     mechanics.metric(about, rod.weights, inertia, rod.drag_across / scale, rod.drag_along / scale, blocks)
     mechanics.bending_gradient(start, heading, rod.clamped, rod.rest_angles, program.work, linear)
-    ratio = interval / given.last_interval if given.last_interval > 0.0 else 0.0
+    ratio = interval / step_input.last_interval if step_input.last_interval > 0.0 else 0.0
     if inertia > 0.0 or ratio > MAX_STEP_RATIO:
         ratio = 0.0
     leading, trailing = (1.0 + 2.0 * ratio) / (1.0 + ratio), ratio / (1.0 + ratio)
-    stiffness = rate * (interval + rod.bending_damping)
+    stiffness = rate * (interval + damping)
     for i in range(nodes):
         for a in range(dimension):
             bending = value = rate * linear[i, a]
             for b in range(dimension):
                 value -= trailing * blocks[i, a, b] * last[i, b]
-            value -= inertia * rod.weights[i] * (last[i, a] + interval / rod.unit * rod.gravity[a])
+            value -= inertia * weights[i] * (last[i, a] + interval / unit * gravity[a])
             for b in range(dimension):
-                value -= blocks[i, a, b] * rod.flow[b] / rod.unit
-            linear[i, a] = value + inertia * rod.weights[i] * rod.flow[a] / rod.unit
-            buffers.drag_linear[i, a] = linear[i, a] - bending
+                value -= blocks[i, a, b] * flow[b] / unit
+            linear[i, a] = value + inertia * weights[i] * flow[a] / unit
+            drag_linear[i, a] = linear[i, a] - bending
         for a in range(dimension):
             for b in range(dimension):
                 blocks[i, a, b] *= leading
-                buffers.drag[i, a, b] = blocks[i, a, b]
-            blocks[i, a, a] += stiffness * rod.bands[0, i]
+                drag[i, a, b] = blocks[i, a, b]
+            blocks[i, a, a] += stiffness * bands[0, i]
         for apart in range(1, 4):
-            couplings[apart - 1, i] = stiffness * rod.bands[apart, i]
-    if rod.bending_damping > 0.0:
-        weight = rate * rod.bending_damping / interval
+            couplings[apart - 1, i] = stiffness * bands[apart, i]
+    if damping > 0.0:
+        weight = rate * damping / interval
         for i in range(nodes):
             for apart in range(-3, 4):
                 if 0 <= i + apart < nodes:
-                    band = weight * rod.bands[abs(apart), min(i, i + apart)]
+                    band = weight * bands[abs(apart), min(i, i + apart)]
                     for a in range(dimension):
                         linear[i, a] += band * (start[i + apart, a] - before[i + apart, a])
     mechanics.tension_stiffness(
@@ -253,210 +425,42 @@ def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -
     that is pulled hard, T dt > Z, swing from side to side and never end.
     """
     nodes, dimension = about.shape
+    linear, blocks, couplings, multipliers = buffers.linear, buffers.blocks, buffers.couplings, buffers.multipliers
     for i in range(nodes - 1):
-        tension = max(buffers.multipliers[i], 0.0)
+        tension = max(multipliers[i], 0.0)
         weight = interval * tension
         for a in range(dimension):
             moved = about[i + 1, a] - start[i + 1, a] - about[i, a] + start[i, a]
-            buffers.linear[i, a] += tension * moved
-            buffers.linear[i + 1, a] -= tension * moved
-            buffers.blocks[i, a, a] += weight
-            buffers.blocks[i + 1, a, a] += weight
-        buffers.couplings[0, i] -= weight
+            linear[i, a] += tension * moved
+            linear[i + 1, a] -= tension * moved
+            blocks[i, a, a] += weight
+            blocks[i + 1, a, a] += weight
+        couplings[0, i] -= weight
+
+
+@compiled_within
+def _solve(buffers: RodBuffers, solver_buffers: banded.SolverBuffers, rows: int, tolerance: float) -> int:
+    """Solve the program of the first rows; where the residuals do not pass, again from a cold start.
+
+    Returns:
+        See `banded.STATUS`; `STALLED` if neither passes.
+    """
+    program, u = program_view(buffers.program, rows), buffers.motion[VELOCITIES]
+    multipliers, worst = buffers.program.multipliers[:rows], buffers.residuals
+    for attempt in range(2):
+        word, _ = banded.solve(program, u, multipliers, solver_buffers)
+        residuals = residuals_with(program, u, multipliers, buffers.program.work)
+        if max(residuals) <= tolerance:
+            for k in range(3):
+                worst[k] = max(worst[k], residuals[k])
+            return int(word) if attempt == 0 else banded.RESTARTED
+        u[:] = 0.0
+        multipliers[:] = 0.0
+    return banded.STALLED
 
 
 @compiled_inner
-def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask, interval: float) -> float:
-    """Write the rows of connectivity and compression together; return the largest |h(y)|.
-
-        grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt,    h_i = (D_i^2 - |y_{i+1} - y_i|^2) / 2
-
-    with the chord D_i of each segment.
-    """
-    nodes, dimension = about.shape
-    strain = 0.0
-    for i in range(nodes - 1):
-        begin, square, moved = min(i, nodes - 3), 0.0, 0.0
-        shift = i - begin
-        for a in range(dimension):
-            buffers.gradient[i, 0, a] = buffers.gradient[i, 1, a] = buffers.gradient[i, 2, a] = 0.0
-            along = about[i + 1, a] - about[i, a]
-            buffers.gradient[i, shift, a], buffers.gradient[i, shift + 1, a] = along, -along
-            square += along * along
-            moved += along * (start[i, a] - about[i, a] - start[i + 1, a] + about[i + 1, a])
-        value = 0.5 * (buffers.chords[i] ** 2 - square)
-        buffers.first[i] = begin
-        buffers.lower[i] = buffers.upper[i] = (-value - moved) / interval
-        buffers.compliance[i] = COMPLIANCE
-        if known[i] and known[i + 1]:
-            # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
-            buffers.lower[i], buffers.upper[i], buffers.multipliers[i] = -np.inf, np.inf, 0.0
-        else:
-            strain = max(strain, abs(value))
-    return strain
-
-
-@compiled_within
-def init_step(buffers: RodBuffers, given: StepInput, unit: float) -> None:
-    """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
-
-    Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
-    farther than a segment: then the guess is where the thread is.
-
-    Args:
-        buffers: written.
-        given: the step.
-        unit: D [m].
-    """
-    motion, known, interval = buffers.motion, buffers.known, given.interval
-    nodes, dimension = given.positions.shape
-    known[:] = False
-    for i in range(nodes):
-        for a in range(dimension):
-            motion[BEFORE, i, a] = motion[START, i, a] = given.positions[i, a] / unit
-            motion[LAST, i, a] = motion[VELOCITIES, i, a] = given.velocities[i, a] / unit
-    for k in range(len(given.nodes)):
-        known[given.nodes[k]] = True
-        for a in range(dimension):
-            motion[START, given.nodes[k], a] = given.ends[k, a] / unit
-    copy_points(motion[START], motion[ABOUT])
-    if not (given.last_interval > 0.0 and interval <= MAX_STEP_RATIO * given.last_interval):
-        return
-    for i in range(nodes):
-        for a in range(dimension):
-            if not known[i]:
-                motion[ABOUT, i, a] = motion[START, i, a] + interval * motion[LAST, i, a]
-                if not abs(motion[ABOUT, i, a] - motion[START, i, a]) <= 1.0:
-                    copy_points(motion[START], motion[ABOUT])
-                    return
-
-
-class StepProgress(NamedTuple):
-    """How far a step has got.
-
-    Attributes:
-        code: `ENDED`; `NO_ROOM` for all contacts in the buffers; or `UNSOLVED`, and then the program is there for
-            another solver.
-        contacts: number of rows of contacts and friction.
-        solves: that the step has had.
-        off: how far off the barriers are over what is allowed, 1 or less if they hold; see `assemble_step`.
-        status: the first of the solves that is not 0, see `banded.STATUS`.
-        residuals: the largest of each kind.
-    """
-
-    code: int
-    contacts: int
-    solves: int
-    off: float
-    status: int
-    residuals: tuple[float, float, float]
-
-
-@compiled_uncounted_without_gil
-def solve_step(
-    model: StepModel,
-    buffers: RodBuffers,
-    solver_buffers: banded.SolverBuffers,
-    given: StepInput,
-    solves: int,
-    elsewhere: float,
-) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
-    """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
-
-    A linearisation that does not halve how far off the barriers are is followed by one halfway back.
-
-    Args:
-        model: the thread and what is around it.
-        buffers: the step under way; it has the program in the end, its multipliers, and the end of the step.
-        solver_buffers: of the structured solver.
-        given: the step.
-        solves: how many this step has had; with none it begins.
-        elsewhere: how far off the rows are that this code does not know, see `assemble_step`.
-
-    Returns:
-        The fields of `StepProgress`, which a named tuple would take as long to return as it takes to set up a step.
-    """
-    about, last_about = buffers.motion[ABOUT], buffers.motion[LAST_ABOUT]
-    if solves == 0:
-        init_step(buffers, given, model.rod.unit)
-    copy_points(about, last_about)
-    primal, dual, complementarity, segments = 0.0, 0.0, 0.0, len(about) - 1
-    # Numbers of a type of their own: a function is compiled again for each number that is written out.
-    first, unknown, status = np.int64(0), np.int64(-1), np.int64(banded.SOLVED)
-    last_off, contacts, code = np.inf, unknown, UNSOLVED
-    off, rubs, halved = np.inf, False, False
-    while True:
-        begun, before = (first, unknown) if halved else (solves, contacts)
-        contacts, assembled_off, assembled_rubs = assemble_step(begun, model, buffers, given, elsewhere, before)
-        if not halved:
-            off, rubs = assembled_off, assembled_rubs
-            if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
-                # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
-                halfway(about, last_about)
-                halved = True
-                continue
-        halved = False
-        last_off = off
-        copy_points(about, last_about)
-        if contacts < 0:
-            code = NO_ROOM
-            break
-        if (off <= 1.0 and not rubs) or solves == model.max_solves:
-            finish_step(model, buffers, given, off)
-            code = ENDED
-            break
-        if not model.structured:
-            break
-        rows = segments + contacts
-        program, multipliers = program_view(buffers.program, buffers.known, rows), buffers.program.multipliers[:rows]
-        word, residuals = solve_checked(program, buffers.motion[VELOCITIES], multipliers, solver_buffers, model)
-        if not max(residuals) <= model.tolerance:
-            break
-        accept_step(buffers, model.workspace.friction, rows, given.interval)
-        primal, dual = max(primal, residuals[0]), max(dual, residuals[1])
-        complementarity = max(complementarity, residuals[2])
-        status, solves = status if status != 0 else word, solves + 1
-    return code, contacts, solves, off, status, (primal, dual, complementarity)
-
-
-@compiled_inline
-def halfway(points: Points, last: Points) -> None:
-    """Move points halfway back to where they were last."""
-    for i in range(len(points)):
-        for a in range(points.shape[1]):
-            points[i, a] = 0.5 * (points[i, a] + last[i, a])
-
-
-@compiled_within
-def solve_checked(
-    program: ChainProgram, u: Points, multipliers: Vector, solver_buffers: banded.SolverBuffers, model: StepModel
-) -> tuple[int, tuple[float, float, float]]:
-    """Solve a program; where the residuals do not pass, again from a cold start. Return status and residuals."""
-    word, residuals = np.int64(banded.SOLVED), (np.inf, np.inf, np.inf)
-    for attempt in range(2):
-        word, _ = banded.solve(program, u, multipliers, solver_buffers)
-        residuals = compiled_residuals(program, u, multipliers)
-        if max(residuals) <= model.tolerance:
-            return word if attempt == 0 else np.int64(banded.RESTARTED), residuals
-        u[:] = 0.0
-        multipliers[:] = 0.0
-    return word, residuals
-
-
-@compiled_within
-def finish_step(model: StepModel, buffers: RodBuffers, given: StepInput, off: float) -> None:
-    """Write where the step ends, and the velocities over it; whatever else holds, nothing passes the wall."""
-    about, before, unit, end = buffers.motion[ABOUT], buffers.motion[BEFORE], model.rod.unit, buffers.end
-    if off > 1.0:
-        move_inside(about, buffers.known, (model.workspace.wall_radius - model.rod.radius) / unit)
-    for i in range(len(about)):
-        for a in range(about.shape[1]):
-            end[0, i, a] = about[i, a] * unit
-            end[1, i, a] = (about[i, a] - before[i, a]) * (unit / given.interval)
-
-
-@compiled_uncounted
-def accept_step(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -> None:
+def _accept(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -> None:
     """Accept the velocities and multipliers in the buffers as the solution of the first rows: keep what follows."""
     start, velocities, about = buffers.motion[START], buffers.motion[VELOCITIES], buffers.motion[ABOUT]
     segments = len(about) - 1
@@ -468,6 +472,19 @@ def accept_step(buffers: RodBuffers, friction: Vector, rows: int, interval: floa
         for a in range(about.shape[1]):
             # Known nodes have moved, and have no velocity.
             about[i, a] = start[i, a] + interval * velocities[i, a]
+
+
+@compiled_within
+def _finish(model: StepModel, buffers: RodBuffers, step_input: StepInput, off: float) -> None:
+    """Write where the step ends, and the velocities over it; whatever else holds, nothing passes the wall."""
+    about, before, unit, end = buffers.motion[ABOUT], buffers.motion[BEFORE], model.rod.unit, buffers.end
+    if off > 1.0:
+        move_inside(about, buffers.program.known, (model.workspace.wall_radius - model.rod.radius) / unit)
+    for i in range(len(about)):
+        for a in range(about.shape[1]):
+            end[END, i, a] = about[i, a] * unit
+            end[END_VELOCITIES, i, a] = (about[i, a] - before[i, a]) * (unit / step_input.interval)
+    link_margins(model.rod, end[END], step_input.heading, buffers.program.work[0], buffers.links)
 
 
 class RodFormulation(Formulation):
@@ -486,45 +503,32 @@ class RodFormulation(Formulation):
     has_friction = True
 
     def __init__(
-        self,
-        thread: Thread,
-        workspace: Workspace,
-        solver: Solver,
-        tolerance: float,
-        barriers: Sequence[Barrier] = (),
+        self, thread: Thread, workspace: Workspace, solver: Solver, tolerance: float, barriers: Sequence[Barrier] = ()
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
-        self.buffers = RodBuffers.of(self._program, self.dimension)
+        self.buffers = RodBuffers.of(self._program)
         medium = thread.medium
-        self.rod = RodProperties(
-            thread.attachment is Attachment.CLAMPED,
-            float(thread.segment_length),
-            float(self._radius),
-            float(thread.bending_stiffness),
-            float(medium.drag_across),
-            float(medium.drag_along),
-            float(medium.mass_per_length),
-            float(medium.bending_damping),
-            self._vector("gravity", medium.gravity),
-            np.ascontiguousarray(thread.rest_angles),
-            mechanics.end_corrected_weights(thread.segments),
-            mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED),
-            self._vector("flow", medium.flow),
-        )
+        clamped, sizes = thread.attachment is Attachment.CLAMPED, (float(thread.segment_length), float(self._radius))
+        drag = float(medium.drag_across), float(medium.drag_along)
+        air = float(medium.mass_per_length), float(medium.bending_damping)
+        weights = mechanics.end_corrected_weights(thread.segments)
+        bands = mechanics.bending_bands(thread.segments, clamped)
+        gravity, flow = self._vector("gravity", medium.gravity), self._vector("flow", medium.flow)
+        rest, bending = np.ascontiguousarray(thread.rest_angles), float(thread.bending_stiffness)
+        self.rod = RodProperties(clamped, *sizes, bending, *drag, *air, gravity, rest, weights, bands, flow)
         first = solver.first if type(solver) is FallbackSolver else solver
-        self._structured = type(first) is BandedSolver  # another one's way of solving is its own
+        structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
         self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._program.first))
         self._solve_step, self._force_kernel = TypedKernel(solve_step), TypedKernel(write_forces)
-        self._segment_kernel = TypedKernel(segment_rows_of)
+        self._link_kernel = TypedKernel(link_margins)
         self._last_nodes = np.arange(1, self._rows + 1, dtype=np.uint32)
         self._last_nodes.flags.writeable = False
-        selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
-        self._self_contact = selves[0] if selves else None
-        self.touches_itself = bool(selves)
-        self._only_self_contact = len(barriers) == len(selves)
+        self._self_contact = next((barrier for barrier in barriers if isinstance(barrier, SelfContact)), None)
+        self.touches_itself = self._self_contact is not None
+        self._only_self_contact = all(isinstance(barrier, SelfContact) for barrier in barriers)
         self._rough = knows_friction(self.workspace.data.friction)
-        self.step_model = StepModel(self.rod, self.workspace.data, float(tolerance), MAX_SOLVES, self._structured)
+        self.step_model = StepModel(self.rod, self.workspace.data, float(tolerance), MAX_SOLVES, structured)
 
     @property
     def nodes_in_contact(self) -> Mask:
@@ -559,159 +563,148 @@ class RodFormulation(Formulation):
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`.
 
-        Compiled code takes the step as long as the structured solver gets on with it. The rows of added barriers are
-        in the program from where it ends without them and one is not met.
+        The rows of added barriers are in the program from where the step ends without them and one is not met.
         """
-        buffers = self.buffers
         if state.interval == 0.0:
             self.forget()
         # Compiled code takes contiguous arrays.
         positions = np.ascontiguousarray(state.positions, np.float64)
         velocities = np.ascontiguousarray(state.velocities, np.float64)
-        given = StepInput(positions, velocities, *drive.arrays(), float(interval), float(state.interval))
-        model = self.step_model
-        worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
-        added: AddedRows | None = None
-        off = 0.0  # how far the added rows are from being met
-        before = None
+        step_input = StepInput(positions, velocities, *drive.arrays(), float(interval), float(state.interval))
+        outcomes: list[tuple[str, str]] = []
+        before = self.warm_start() if self.added else None
         if self.added:
             self.added.begin(positions, drive, interval)
-            before = self.warm_start()
-        while True:
-            done = self.solve(given, solves, off, model)
-            worst, solves = _worse(worst, done.residuals), done.solves
-            status = status if status != SOLVED else banded.STATUS[done.status]
-            if done.code == NO_ROOM:
-                self._refuse_contacts()
-            if done.code == ENDED:
-                if before is not None and added is None:
-                    try:
-                        added = self._linearised(interval)
-                    except InvalidInputError:  # of a user's barrier: the step is not taken
-                        self.restore(before)
-                        raise
-                    if added.unmet:
-                        model, off = model._replace(structured=False, max_solves=solves + MAX_SOLVES), np.inf
-                        continue
-                break
-            rows = self._rows + done.contacts
-            program = first_rows(self._program, buffers.known, rows)
-            solution = self._solve(program, buffers.motion[VELOCITIES], added)
+        progress = self._complete(step_input, self.solve(step_input), outcomes)
+        if before is not None:
+            try:
+                added = self._linearised(self.buffers.motion[ABOUT], interval)
+            except InvalidInputError:  # of a user's barrier: the step is not taken
+                self.restore(before)
+                raise
+            if added.unmet:
+                solves = progress.solves
+                model = self.step_model._replace(structured=False, max_solves=solves + MAX_SOLVES)
+                progress = self.solve(step_input, solves, math.inf, model=model)
+                progress = self._complete(step_input, progress, outcomes, model, added)
+        return self._result(step_input, progress, outcomes)
+
+    def _complete(
+        self,
+        step_input: StepInput,
+        progress: StepProgress,
+        outcomes: list[tuple[str, str]],
+        model: StepModel | None = None,
+        added: AddedRows | None = None,
+    ) -> StepProgress:
+        """Solve what compiled code leaves, with the rows of added barriers, until the step has ended.
+
+        Args:
+            step_input: of the step.
+            progress: of compiled code.
+            outcomes: status and solver of solves, which those of this are added to.
+            model: of the solves that follow; None for the formulation's own.
+            added: rows that compiled code does not know.
+        """
+        buffers, motion, interval = self.buffers, self.buffers.motion, step_input.interval
+        outcomes.append((banded.STATUS[progress.status], self._solver.name))
+        force: Points | None = None
+        while progress.code == UNSOLVED:
+            rows, off = self._rows + progress.contacts, 0.0
+            solution = self._solve(first_rows(self._program, rows), motion[VELOCITIES], added)
+            outcomes.append((solution.status, solution.solver))
             self._program.multipliers[:rows], pushes = np.split(solution.multipliers, [rows])
-            buffers.motion[VELOCITIES] = solution.velocities
-            accept_step(buffers, self.workspace.data.friction, rows, interval)
+            motion[VELOCITIES] = solution.velocities
+            np.maximum(buffers.residuals, solution.residuals, out=buffers.residuals)
             if added is not None:
-                if self._only_self_contact:
-                    buffers.contact_force[:] += added.force(pushes, positions.shape)
-                    buffers.tail_load[:] += added.force(pushes, positions.shape)[0]
-                added = self._linearised(interval)
+                force = added.force(pushes, motion[VELOCITIES].shape) if self._only_self_contact else None
+                added = self._linearised(motion[START] + interval * motion[VELOCITIES], interval)
                 off = added.off
-            worst, solves = _worse(worst, solution.residuals), solves + 1
-            if status == SOLVED:
-                status, solver = solution.status, solution.solver
-        end, velocity = buffers.end.copy()
-        after = ThreadState(end, velocity, interval)
-        if done.off > 1.0:
-            words = f"not converged in {solves} linearisations, off by {done.off:.1g} times what is allowed"
-            status = f"{words}; {status}"
-        loads = buffers.internal.copy(), buffers.contact_force.copy(), buffers.tail_load.copy()
-        grip, own_way = buffers.grips.force.copy() if self._rough else None, self._self_contact
-        passed = done.off > 1.0 and own_way is not None and own_way.passed(positions, end)
-        return StepResult(after, solver, status, worst, solves, done.off <= 1.0, loads, grip, passed)
+            progress = self.solve(step_input, progress.solves + 1, off, rows, model)
+            outcomes.append((banded.STATUS[progress.status], self._solver.name))
+        if progress.code == NO_ROOM:
+            self._refuse_contacts()
+        if force is not None:
+            buffers.end[CONTACT] += force
+            buffers.tail_load[:] += force[0]
+        return progress
+
+    def _linearised(self, about: Points, interval: float) -> AddedRows:
+        return self.added.linearised(about, self.buffers.motion[START], self._program.known, interval)
+
+    def _result(self, step_input: StepInput, progress: StepProgress, outcomes: Sequence[tuple[str, str]]) -> StepResult:
+        """Return what the buffers have of a step that has ended."""
+        buffers, off, solves, barrier = self.buffers, progress.off, progress.solves, self._self_contact
+        end, residuals = buffers.end.copy(), Residuals(*buffers.residuals.tolist())
+        state = ThreadState(end[END], end[END_VELOCITIES], step_input.interval)
+        status, solver = next((outcome for outcome in outcomes if outcome[0] != SOLVED), outcomes[-1])
+        grip, passed = buffers.grips.force.copy() if self._rough else None, False
+        if off > 1.0:
+            status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
+            passed = barrier is not None and barrier.passed(step_input.positions, state.positions)
+        loads, links = (end, buffers.tail_load.copy()), buffers.links.copy()
+        return StepResult(state, solver, status, residuals, solves, off <= 1.0, loads, grip, links, passed)
 
     def solve(
-        self, step_input: StepInput, solves: int = 0, elsewhere: float = 0.0, model: StepModel | None = None
+        self,
+        step_input: StepInput,
+        solves: int = 0,
+        elsewhere: float = 0.0,
+        rows: int = 0,
+        model: StepModel | None = None,
     ) -> StepProgress:
         """Let compiled code take a step as far as it gets; see `solve_step`. Arrays have to be contiguous."""
         model = self.step_model if model is None else model
-        arguments = model, self.buffers, self._solver_buffers, step_input, solves, elsewhere
+        arguments = model, self.buffers, self._solver_buffers, step_input, solves, elsewhere, rows
         return StepProgress(*self._solve_step(*arguments))
 
     def separate(self) -> RodFormulation:
         """Return the same formulation with buffers of its own, for the steps of another thread like this one."""
-        other, dimension = copy(self), self.dimension
-        other._program = StepBuffers.of(self._rows + 1, dimension, self._rows)
-        other.buffers = RodBuffers.of(other._program, dimension)
-        other._solver_buffers = BandedSolver().buffers(self._rows + 1, dimension, len(self._program.first))
+        other = copy(self)
+        other._program = StepBuffers.of(self._rows + 1, self.dimension, self._rows)
+        other.buffers = RodBuffers.of(other._program)
+        other._solver_buffers = BandedSolver().buffers(self._rows + 1, self.dimension, len(self._program.first))
         return other
-
-    def _linearised(self, interval: float) -> AddedRows:
-        motion = self.buffers.motion
-        return self.added.linearised(motion[ABOUT], motion[START], self.buffers.known, interval)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
         assert result.loads is not None
-        state, (internal, contact, load) = result.state, result.loads
-        tension, force = np.empty(self._rows), np.empty(self.dimension)
-        moved = state.positions / self.rod.unit, state.velocities, state.interval
-        moment, scale = self.write_forces(*moved, heading, (internal, load), tension, force)
-        friction, use = np.zeros((2, self._rows + 1))
+        tension, force, (friction, use) = np.empty(self._rows), np.empty(self.dimension), np.zeros((2, self._rows + 1))
+        moment, scale = self.write_forces(result.loads, result.state.interval, heading, tension, force)
         if result.grip is not None:
             friction, use = friction_of(result.grip)
-            friction *= scale
-        return ThreadForces(tension, scale * contact, force, moment, friction, use)
+        return ThreadForces(tension, scale * result.loads[0][CONTACT], force, moment, scale * friction, use)
 
     def write_forces(
-        self,
-        positions: Points,
-        velocities: Points,
-        interval: float,
-        heading: Points,
-        loads: tuple[Points, Vector],
-        tension: Vector,
-        force: Vector,
+        self, loads: tuple[Table, Vector], interval: float, heading: Points, tension: Vector, force: Vector
     ) -> tuple[float, float]:
-        """Write tension and force at the end of a step; see `write_forces`. Arrays have to be contiguous.
-
-        Args:
-            positions: of all nodes, shape (n + 1, d) [D].
-            velocities: over the step [m/s].
-            interval: of the step [s].
-            heading: of the needle, shape (d,).
-            loads: `internal` and `tail_load` of the buffers.
-            tension: written, shape (n,) [N].
-            force: upon the needle, written, shape (d,) [N].
-
-        Returns:
-            The moment [N m], and the force of a unit of the loads [N].
-        """
-        rod = self.rod
-        scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
-        along = np.ascontiguousarray(heading)
-        arguments = rod, positions, velocities, along, *loads, scale, tension, force
-        return self._force_kernel(*arguments), scale
+        """Write tension and force on the needle at the end of a step [s]; see `write_forces` of compiled code."""
+        moment, scale = self._force_kernel(self.rod, *loads, interval, np.ascontiguousarray(heading), tension, force)
+        return moment, scale
 
     def warm_up(self) -> None:
-        """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
+        """Load what only some steps need; see `Formulation`."""
         super().warm_up()
-        nodes, heading = self._thread.segments + 1, np.eye(self.dimension)[0]
-        still, chain = np.zeros((nodes, self.dimension)), np.outer(np.arange(nodes), heading)
-        accept_step(self.buffers, self.workspace.data.friction, self._rows, 1.0)
-        tension, force = np.zeros(self._rows), np.zeros(self.dimension)
-        self.write_forces(chain, still, 1.0, heading, (still, force), tension, force)
+        chain = np.outer(np.arange(self._rows + 1.0), np.eye(self.dimension)[0])
+        loads = np.array([chain, *np.zeros((3, *chain.shape))]), np.zeros(self.dimension)
+        self.write_forces(loads, 1.0, chain[1], np.empty(self._rows), np.empty(self.dimension))
 
-    def strain(self, positions: Points, heading: Points) -> Vector:
+    def strain(self, positions: Points, heading: Points, links: Table | None = None) -> Vector:
         """Return each segment's length over the chord of its arc, less one; see `Formulation`."""
-        rows = self._segment_rows(positions, heading)
+        rows = self._link_margins(positions, heading) if links is None else links
         return np.asarray(rows[3] / rows[4])
 
-    def _segment_rows(self, positions: Points, heading: Points) -> Table:
-        """Return value and clearance of connectivity and of compression, and the chords; see `segment_rows_of`."""
+    def _link_margins(self, positions: Points, heading: Points) -> Table:
+        """Return value and clearance of connectivity and of compression, and the chords; see `link_margins`."""
         points, rows = np.ascontiguousarray(positions), np.empty((5, self._rows))
-        self._segment_kernel(self.rod, points, np.ascontiguousarray(heading), np.empty(points.shape), rows)
+        self._link_kernel(self.rod, points, np.ascontiguousarray(heading), np.empty(points.shape), rows)
         return rows
 
-    def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
+    def segment_margins(self, positions: Points, heading: Points, links: Table | None = None) -> list[BarrierMargins]:
         """Return connectivity and compression; see `Formulation`."""
-        rows = self._segment_rows(positions, heading)
+        rows = self._link_margins(positions, heading) if links is None else links
         column = constant_column(NO_OBSTACLE, self._rows, "i4")
         return [
             BarrierMargins(CONNECTIVITY, self._last_nodes, column, rows[0], rows[1]),
             BarrierMargins(COMPRESSION, self._last_nodes, column, rows[2], rows[3]),
         ]
-
-
-def _worse(one: tuple[float, float, float], other: tuple[float, float, float]) -> Residuals:
-    """Return the larger residual of each kind."""
-    return Residuals(*(max(pair) for pair in zip(one, other, strict=True)))

@@ -61,13 +61,9 @@ def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
     coordinates = np.arange(nodes * dimension).reshape(nodes, dimension)
     unknown = np.flatnonzero(np.repeat(~program.known, dimension))
     near = program.first[:, None] + np.arange(SPAN)
-    image = sp.vstack(
-        [
-            _rows(coordinates[near], program.gradient, nodes * dimension),
-            _rows(coordinates[program.far_nodes], program.far_gradient, nodes * dimension),
-        ],
-        format="csc",
-    )[:, unknown]
+    band = _rows(coordinates[near], program.gradient, nodes * dimension)
+    far = _rows(coordinates[program.far_nodes], program.far_gradient, nodes * dimension)
+    image = sp.vstack([band, far], format="csc")[:, unknown]
     count = len(program.lower)
     soft, limited = np.flatnonzero(program.compliance > 0.0), np.flatnonzero(program.limit < np.inf)
     slack = sp.csc_matrix((np.sqrt(program.compliance[soft]), (soft, np.arange(len(soft)))), (count, len(soft)))
@@ -116,13 +112,8 @@ class OsqpSolver:
     name = "osqp"
 
     def __init__(self, tolerance: float = 1e-7, iterations: int = 20_000) -> None:
-        self._settings: dict[str, Any] = {
-            "eps_abs": tolerance,
-            "eps_rel": tolerance,
-            "max_iter": iterations,
-            "polishing": True,
-            "verbose": False,
-        }
+        tolerances = {"eps_abs": tolerance, "eps_rel": tolerance}
+        self._settings: dict[str, Any] = {**tolerances, "max_iter": iterations, "polishing": True, "verbose": False}
         self._solver: Any = None
         self._loaded: QuadraticProgram | None = None
 
@@ -168,11 +159,7 @@ class OsqpSolver:
 
 def _same_pattern(one: sp.csc_matrix, other: sp.csc_matrix) -> bool:
     """Return whether the entries of two matrices are at the same places."""
-    return (
-        one.shape == other.shape
-        and np.array_equal(one.indptr, other.indptr)
-        and np.array_equal(one.indices, other.indices)
-    )
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("shape", "indptr", "indices"))
 
 
 class FallbackSolver:

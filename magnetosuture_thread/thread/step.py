@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.barrier import OBSTACLE, WALL, Barrier, BarrierRows
 from magnetosuture_thread.geometry.compiled import TypedKernel
-from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.barriers import SolidRows, solid_rows
-from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE
 from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
+from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.program import (
     ChainProgram,
     Indices,
@@ -33,10 +34,6 @@ from magnetosuture_thread.thread.program import (
     first_rows,
     residuals_of,
 )
-
-DISTANCE_TOLERANCE = 1e-7  # m; an added row that is met but for this much of its nodes' way holds
-MARGINS_PER_NODE = 16  # for which there is room at first
-UNMET_COMPLIANCE = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ class PrescribedMotion:
         time: at the end of the step [s].
     """
 
-    nodes: tuple[int, ...]
+    nodes: Sequence[int] | Indices
     positions: Points
     heading: Points
     time: float = 0.0
@@ -95,7 +92,7 @@ class PrescribedMotion:
     def arrays(self) -> tuple[Indices, Points, Points]:
         """Return the nodes, where they are at the end, and the heading, for compiled code."""
         ends = np.ascontiguousarray(self.positions, dtype=np.float64).reshape(len(self.nodes), len(self.heading))
-        return np.array(self.nodes, dtype=np.int64), ends, np.ascontiguousarray(self.heading, dtype=np.float64)
+        return np.asarray(self.nodes, np.int64), ends, np.ascontiguousarray(self.heading, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -110,9 +107,9 @@ class StepResult:
         solves: number of programs solved.
         converged: whether the end satisfies the barriers themselves, not only their last linearisation; of
             `paper` the hard ones, those of the obstacles.
-        loads: what the segments push the nodes with, and what contacts do, shape (n + 1, d), and what medium and
-            contacts do at the needle's tail, shape (d,), in the program's units; None where these are of no mechanics.
+        loads: `end` and `tail_load` of `RodBuffers`; None where these are of no mechanics.
         grip: of friction, as in `GripBuffers`; None where no shape has any.
+        links: as in `RodBuffers`; None where they are not worked out with the step.
         passed: whether the thread has passed through itself where it may not; then the step must not be taken.
     """
 
@@ -122,8 +119,9 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
-    loads: tuple[Points, Points, Vector] | None = field(default=None, compare=False)
+    loads: tuple[Table, Vector] | None = field(default=None, compare=False)
     grip: Table | None = field(default=None, compare=False)
+    links: Table | None = field(default=None, compare=False)
     passed: bool = False
 
 
@@ -196,6 +194,10 @@ class AddedBarriers:
         self.move_to(stamp, positions[0], heading)
         return [barrier.rows(positions) for barrier in self._barriers]
 
+    def margins_at(self, stamp: float, positions: Points, heading: Points) -> list[BarrierMargins]:
+        """Return the margins of each barrier; see `rows_at`."""
+        return [BarrierMargins.from_rows(rows) for rows in self.rows_at(stamp, positions, heading)]
+
     def move_to(self, stamp: float, tail: Points, heading: Points) -> None:
         """Set the stamp of the next evaluation [s], and the needle: where the thread is fixed [m], and its heading."""
         self._heading = heading
@@ -245,15 +247,16 @@ class AddedBarriers:
             moved = np.einsum("rkd,rkd->r", gradient, (start - about)[nodes])
             lower = (missing / self._unit - moved) / interval
             soft, most = 1.0 / barrier.slack_weight, float(missing.max(initial=0.0))
-            compliance = np.where(lower > 0.0, max(soft, UNMET_COMPLIANCE), soft)
-            off = most / DISTANCE_TOLERANCE if soft == 0.0 else 0.0
+            # Against a hard row that has to be met from outside something else may hold.
+            compliance = np.where(lower > 0.0, max(soft, 1e-7), soft)
+            off = most / DEPTH_TOLERANCE if soft == 0.0 else 0.0
             unmet = off > 1.0 if soft == 0.0 else most > 0.0
             found.append(AddedRows(nodes, gradient, lower, compliance, unmet, off))
         width = max(rows.nodes.shape[1] for rows in found)
-        wide = [width - rows.nodes.shape[1] for rows in found]
+        wide = [(rows, width - rows.nodes.shape[1]) for rows in found]
         return AddedRows(
-            np.concatenate([np.pad(r.nodes, ((0, 0), (0, w)), mode="edge") for r, w in zip(found, wide, strict=True)]),
-            np.concatenate([np.pad(r.gradient, ((0, 0), (0, w), (0, 0))) for r, w in zip(found, wide, strict=True)]),
+            np.concatenate([np.pad(rows.nodes, ((0, 0), (0, more)), mode="edge") for rows, more in wide]),
+            np.concatenate([np.pad(rows.gradient, ((0, 0), (0, more), (0, 0))) for rows, more in wide]),
             np.concatenate([rows.lower for rows in found]),
             np.concatenate([rows.compliance for rows in found]),
             any(rows.unmet for rows in found),
@@ -301,8 +304,12 @@ class Formulation(ABC):
         friction = (workspace.friction, workspace.wall_friction) if self.has_friction else ((), 0.0)
         self.workspace = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)
-        self._contacts = Contacts.room(MARGINS_PER_NODE * nodes, self.dimension)  # memory of margins
-        self._solid_rows = TypedKernel(solid_rows)
+        # Memory of margins.
+        self._nearby = np.full(len(workspace.shapes), -1)
+        self._solid_rows = SolidRows.room((len(workspace.shapes) + 1) * nodes, self.dimension)
+        self._write_solid_rows = TypedKernel(solid_rows)
+        nothing = SolidRows.room(0, self.dimension)
+        self._far_from_solids = [BarrierMargins(name, *nothing[:4], normal=nothing.normal) for name in (OBSTACLE, WALL)]
         self._rows, self._program = rows, StepBuffers.of(nodes, self.dimension, rows)
 
     @abstractmethod
@@ -316,7 +323,7 @@ class Formulation(ABC):
     def warm_up(self) -> None:
         """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
         nodes = self._thread.segments + 1
-        program = first_rows(self._program, np.zeros(nodes, dtype=np.bool_), self._rows)
+        program = first_rows(self._program, self._rows)
         solution = self._solver.solve(program, np.zeros((nodes, self.dimension)), np.zeros(self._rows))
         residuals_of(program, solution.velocities, solution.multipliers)
         self.forget()
@@ -346,8 +353,8 @@ class Formulation(ABC):
             InvalidInputError: it is such a one.
         """
 
-    def strain(self, positions: Points, heading: Points) -> Vector:
-        """Return each segment's length over what it should be from end to end, less one, shape (n,)."""
+    def strain(self, positions: Points, heading: Points, links: Table | None = None) -> Vector:
+        """Return each segment's length over what it should be from end to end, less one, shape (n,); see `margins`."""
         along = positions[1:] - positions[:-1]
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", along, along)) / self._thread.segment_length - 1.0)
 
@@ -361,29 +368,34 @@ class Formulation(ABC):
         return None
 
     @abstractmethod
-    def segment_margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
+    def segment_margins(self, positions: Points, heading: Points, links: Table | None = None) -> list[BarrierMargins]:
         """Return the margins of the built-in barriers of the thread itself, obstacles and wall aside."""
 
-    def margins(self, positions: Points, heading: Points) -> list[BarrierMargins]:
-        """Return the margins of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
-        return [*self.segment_margins(positions, heading), *self.solid_margins(positions)]
+    def margins(self, positions: Points, heading: Points, links: Table | None = None) -> list[BarrierMargins]:
+        """Return the margins of the built-in barriers at positions of shape (n + 1, d) [m], in SI units.
+
+        Args:
+            positions: of all nodes.
+            heading: of the needle.
+            links: of the step that led there, see `StepResult`.
+        """
+        return [*self.segment_margins(positions, heading, links), *self.solid_margins(positions)]
 
     def solid_margins(self, positions: Points) -> list[BarrierMargins]:
         """Return the margins of obstacles and wall at positions of shape (n + 1, d) [m].
 
         The clearance is that of the node and the half segments beside it.
         """
-        points, count, obstacles = np.ascontiguousarray(positions), -1, 0
-        while count < 0:
-            rows = SolidRows.room(len(self._contacts.node), self.dimension)
-            known = points, self._margin_workspace.data, self._radius, self._contacts
-            count, obstacles = self._solid_rows(*known, rows)
-            if count < 0:  # in a scene of many shapes a node may be near all of them
-                self._contacts = Contacts.room(4 * len(self._contacts.node), self.dimension)
-        node, obstacle, value, clearance, normal = (column[:count].copy() for column in rows)
+        points, rows = np.ascontiguousarray(positions), self._solid_rows
+        memory = self._margin_workspace.data, self._radius, self._nearby, rows
+        count, obstacles = self._write_solid_rows(points, *memory)
+        if count == 0:
+            return self._far_from_solids
+        parts = (OBSTACLE, slice(0, obstacles)), (WALL, slice(obstacles, count))
+        columns = [(name, [column[part].copy() for column in rows]) for name, part in parts]
         return [
-            BarrierMargins(name, node[part], obstacle[part], value[part], clearance[part], normal=normal[part])
-            for name, part in ((OBSTACLE, slice(obstacles)), (WALL, slice(obstacles, None)))
+            BarrierMargins(name, node, obstacle, value, clearance, normal=normal)
+            for name, (node, obstacle, value, clearance, normal) in columns
         ]
 
     def _solve(self, program: ChainProgram, velocities: Points, added: AddedRows | None) -> Solution:

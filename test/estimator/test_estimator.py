@@ -21,7 +21,7 @@ from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.program import StepBuffers, program_of
+from magnetosuture_thread.thread.program import StepBuffers, first_rows
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import as_quadratic_program
 from test.estimator.threads import (
@@ -224,9 +224,9 @@ def test_what_cannot_be_estimated_is_refused() -> None:
 NODES = 13
 
 
-def dense_of(buffers: StepBuffers, known: np.ndarray, rows: int) -> np.ndarray:
+def dense_of(buffers: StepBuffers) -> np.ndarray:
     """Return P of a program, dense."""
-    program = as_quadratic_program(program_of(buffers, known, rows))
+    program = as_quadratic_program(first_rows(buffers, 0))
     upper = program.P.toarray()[: 2 * NODES, : 2 * NODES]
     return upper + upper.T - np.diag(np.diag(upper))
 
@@ -235,7 +235,7 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     """A straight thread has no constraint across it, so that across it the update is the plain one."""
     rng, straight = np.random.default_rng(4), np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
     place, ones = np.sort(rng.uniform(0.2, NODES - 1.0, 40)), np.ones(40)
-    points = MeasuredPoints(place, rng.normal(0.0, 5e-5, 40), 1e-4 * ones, ones, ones)
+    points = MeasuredPoints(place, rng.normal(0.0, 5e-5, 40), 1e-4 * ones, ones, ones, ones.copy())
     predictor = predictor_of(thread_of(NODES - 1))
     assert isinstance(predictor.formulation, RodFormulation)
     corrector = Corrector(predictor, predictor.formulation)
@@ -245,7 +245,7 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     assert correction.residual < 1e-6
     check = StepBuffers.of(NODES, 2, 1)
     prior_information(prior, 1.0, False, check)
-    information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
+    information = dense_of(check)[2:, 2:][1::2, 1::2]
     rows = -np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(1.0, NODES)))  # to the left of a thread to the west
     covariance = np.linalg.inv(information)
     spread = rows @ covariance @ rows.T + np.diag(points.variance)

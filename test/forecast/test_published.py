@@ -97,12 +97,7 @@ def test_forecasts_that_are_worse_than_nothing_moves_are_withheld_with_the_reaso
 
 
 @pytest.mark.parametrize(
-    "poses",
-    [
-        [[1e300, 0.0, 0.0], [-1e300, 0.0, 0.0]],
-        [[0.0, 0.0, math.nan]] * 2,
-        [[0.0] * 3] * 20_001,
-    ],
+    "poses", [[[1e300, 0.0, 0.0], [-1e300, 0.0, 0.0]], [[0.0, 0.0, math.nan]] * 2, [[0.0] * 3] * 20_001]
 )
 def test_a_plan_arrives_with_its_angles_and_one_that_no_needle_can_follow_is_refused(poses: list[list[float]]):
     sound, message = (

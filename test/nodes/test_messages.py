@@ -30,8 +30,8 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
+from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.prediction import Prediction
 from magnetosuture_thread.vision.tracker import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole

@@ -10,8 +10,8 @@ import numpy as np
 
 from magnetosuture_thread.geometry.obstacles import Obstacle, Workspace
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
-from magnetosuture_thread.thread.paper import PaperOptions
-from magnetosuture_thread.thread.predictor import make_formulation
+from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
+from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import make_solver
 from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState
 
@@ -53,7 +53,8 @@ def formulated(
 ) -> Formulation:
     """Return a formulation of a thread among obstacles, in a dish of a radius; margins reach 5 cm."""
     workspace = Workspace(obstacles, 0.05, dimension, wall)
-    return make_formulation(name, thread, workspace, make_solver(solver, TOLERANCE), TOLERANCE, paper)
+    parts = thread, workspace, make_solver(solver, TOLERANCE), TOLERANCE
+    return RodFormulation(*parts) if name == "rod" else PaperFormulation(*parts, paper)
 
 
 def east(dimension: int = 2) -> np.ndarray:

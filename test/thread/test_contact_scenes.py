@@ -109,7 +109,7 @@ def test_more_contacts_than_there_is_room_for_are_refused_and_the_thread_stays_w
     assert isinstance(crowded.formulation, RodFormulation)
     density = np.full(thread.segments + 1, 1e-4)
     prior = Prior(before.positions / thread.segment_length, EAST, density, density, 2.0, 1.0)
-    points = MeasuredPoints(np.arange(1.0, 20.0), *np.full((2, 19), 1e-3), *np.ones((2, 19)))
+    points = MeasuredPoints(np.arange(1.0, 20.0), *np.full((2, 19), 1e-3), *np.ones((3, 19)))
     refused = Corrector(crowded, crowded.formulation).solve(prior, points)
     assert f"more than {CONTACTS_PER_NODE} contacts a node" in refused.problem
 

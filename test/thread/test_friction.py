@@ -12,13 +12,7 @@ from benchmarks.friction import DIAMETER, capstan_error, stiff_capstan
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.geometry.barrier import BarrierRows
 from magnetosuture_thread.thread.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
-from magnetosuture_thread.thread.margins import (
-    BarrierMargins,
-    Friction,
-    FrictionLaw,
-    FrictionState,
-    Margins,
-)
+from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionLaw, FrictionState, Margins
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=2e-4)

@@ -13,16 +13,7 @@ from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector
 from magnetosuture_thread.thread.solvers import BandedSolver
 from magnetosuture_thread.thread.step import ThreadState
-from test.thread.scenes import (
-    DT,
-    TOLERANCE,
-    east,
-    followed,
-    formulated,
-    lead,
-    polyamide,
-    straight,
-)
+from test.thread.scenes import DT, TOLERANCE, east, followed, formulated, lead, polyamide, straight
 
 
 class Listening:

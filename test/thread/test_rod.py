@@ -15,18 +15,7 @@ from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solutio
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
 from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState
-from test.thread.scenes import (
-    DT,
-    TOLERANCE,
-    east,
-    followed,
-    formulated,
-    lead,
-    polyamide,
-    silk,
-    straight,
-    stretch,
-)
+from test.thread.scenes import DT, TOLERANCE, east, followed, formulated, lead, polyamide, silk, straight, stretch
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

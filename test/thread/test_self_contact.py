@@ -11,8 +11,8 @@ import shapely
 from benchmarks.self_contact import move_model
 from magnetosuture_thread import InvalidInputError, NeedlePose, Scene, ThreadPredictor
 from magnetosuture_thread.geometry.scene import Dish
+from magnetosuture_thread.thread.barriers import SelfContact
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
-from magnetosuture_thread.thread.self_contact import SelfContact
 
 EAST = np.array([1.0, 0.0])
 DIAMETER = 60e-6
