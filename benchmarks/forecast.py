@@ -55,17 +55,17 @@ class ProcedureControl:
         return self.session.status.state in ENDED
 
     def __call__(self, stamp: float, tail: Points, heading: Points, condition: ThreadCondition) -> Vector:
-        """Return the velocity for a measured pose, shape (2,) [m/s]."""
+        """Return the motion that is commanded at a measured pose, shape (3,)."""
         session, known = self.session, self.session.known
         known.on_prediction(stamp, condition.tension, lambda: condition.vertices)
         known.on_margins(stamp, condition.problem, condition.friction_nodes, condition.slowdown, known.scene_version)
-        session.on_bridge(True, condition.drift)
+        session.on_bridge(True, condition.pull.tolist())
         if session.status.state is None and not condition.problem:
             session.on_pose(stamp, tail, heading, stamp)
             session.plan(self._procedure, stamp)
             session.resume()
         velocity = session.on_pose(stamp, tail, heading, stamp)
-        return np.zeros(2) if velocity is None else velocity
+        return np.zeros(3) if velocity is None else velocity
 
 
 def run_loop(name: str, seed: int) -> tuple[Setup, LoopRecord]:

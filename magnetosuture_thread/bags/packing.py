@@ -46,7 +46,10 @@ IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of
 SELF_CONTACT = {None: 0, True: 1, False: 2}  # as in Scene.msg
 BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian, as every ROS 2 machine of today writes it
 _COUNT = struct.Struct("<I")
-DISH = _COUNT.pack(len(interface.DISH_FRAME.encode()) + 1) + interface.DISH_FRAME.encode() + b"\0"
+DISH, NEEDLE = (
+    _COUNT.pack(len(frame.encode()) + 1) + frame.encode() + b"\0"
+    for frame in (interface.DISH_FRAME, interface.NEEDLE_FRAME)
+)
 DISH_END = len(BEGIN) + 8 + len(DISH)  # where a header in the dish frame ends, behind its stamp
 LIFETIME = 500_000_000  # ns of a marker that is a text, an arrow or a forecast; poses come far more often
 COLOURS: dict[str, Colour] = {
@@ -67,10 +70,11 @@ def pack(layout: str, *values: Any) -> bytes:
 
     Args:
         layout: the kinds of its fields in their order, with those of nested messages in their place, separated by
-            spaces. `header` is a stamp in the dish frame and `time` a stamp, both of type `Stamp`; `text` is a string;
-            numbers have their names in ROS. `float64[]` is a sequence of numbers, `float64[9]` an array, whose numbers
-            stand without a count; `points` is an array of shape (m, 2) as a sequence of points or vectors with z = 0;
-            `texts` is a sequence of strings; `raw` is bytes that are in place as they are.
+            spaces. `header` is a stamp in the dish frame, `needle_header` one in the needle's, and `time` a stamp, all
+            of type `Stamp`; `text` is a string; numbers have their names in ROS. `float64[]` is a sequence of numbers,
+            `float64[9]` an array, whose numbers stand without a count; `points` is an array of shape (m, 2) as a
+            sequence of points or vectors with z = 0; `texts` is a sequence of strings; `raw` is bytes that are in place
+            as they are.
         values: of the fields.
     """
     data = bytearray(BEGIN)
@@ -78,10 +82,10 @@ def pack(layout: str, *values: Any) -> bytes:
         if kind == "number":
             data += bytes((4 - len(data)) % size)
             data += number.pack(value)
-        elif kind in ("header", "time"):
+        elif kind in ("header", "needle_header", "time"):
             seconds = divmod(value, 10**9) if isinstance(value, int) else (value.sec, value.nanosec)
             data += bytes(-len(data) % 4) + struct.pack("<iI", *seconds)
-            data += DISH if kind == "header" else b""
+            data += {"header": DISH, "needle_header": NEEDLE, "time": b""}[kind]
         elif kind == "text":
             _put_text(data, value)
         elif kind == "texts":
@@ -190,7 +194,15 @@ def packed_point(stamp: Stamp, point: Vector) -> bytes:
 
 
 def packed_twist(stamp: Stamp, velocity: Vector) -> bytes:
-    """Return a velocity of shape (2,) [m/s] as a TwistStamped."""
+    """Return a motion as a TwistStamped.
+
+    Args:
+        stamp: of the message.
+        velocity: of the tip in the dish frame, shape (2,) [m/s]; or in the needle's frame along and to the left [m/s],
+            and the turn rate [rad/s], shape (3,).
+    """
+    if len(velocity) == 3:
+        return pack("needle_header float64[6]", stamp, (velocity[0], velocity[1], 0.0, 0.0, 0.0, velocity[2]))
     return pack("header float64[6]", stamp, (velocity[0], velocity[1], 0.0, 0.0, 0.0, 0.0))
 
 
@@ -426,18 +438,18 @@ def packed_bridge_state(stamp: Stamp, system: CoilSystem, driver: DriverState, r
     """
     latch, output = system.latch, system.output
     velocities: tuple[float, ...] = (0.0,) * 9
-    drift, saturated, currents, reasons = 0.0, False, np.empty(0), system.closed_reasons
+    pull, saturated, currents, reasons = np.zeros(2), False, np.empty(0), system.closed_reasons
     if output is not None:
-        velocities, drift, reasons = _velocities(output), output.drift, output.reasons
+        velocities, pull, reasons = _velocities(output), output.pull, output.reasons
         currents, saturated = output.allocation.currents, output.allocation.saturated
     closed = output is None and not latch.latched_reason
     # As in CoilBridgeState.msg.
     state = 0 if closed else ("UNCONFIGURED", "INACTIVE", "ACTIVE", "FAULT").index(latch.state.name)
-    layout = "header uint8 bool bool text texts float64[9] float64 bool text bool texts float64[] float64[] float64[] "
+    layout = "header uint8 bool bool text texts float64[12] bool text bool texts float64[] float64[] float64[] "
     return pack(
         layout + "uint32",
         *(stamp, state, latch.armed, latch.emergency),
-        *("" if system.bridge is None else system.bridge.scene_version, reasons, velocities, drift, saturated),
+        *("" if system.bridge is None else system.bridge.scene_version, reasons, (*velocities, *pull, 0.0), saturated),
         *(system.driver_name, driver.ready, driver.warnings, currents),
         *(() if driver.currents is None else driver.currents, driver.voltages, refused),
     )

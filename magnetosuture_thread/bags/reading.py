@@ -284,19 +284,25 @@ def _finite_points(corners: Any, field: str, minimum: int) -> Points:
     return _finite([(point.x, point.y) for point in corners], field, "finite numbers")
 
 
-def plane_velocity(message: Any, field: str) -> Vector:
-    """Return the velocity of a TwistStamped in the dish plane, shape (2,) [m/s].
+def needle_command(message: Any, field: str) -> Vector:
+    """Return the motion that a TwistStamped commands: shape (2,), of the tip [m/s], or shape (3,), see `NeedleTwist`.
+
+    In the dish frame its linear velocity is that of the tip, and turns the needle. In the needle's frame it is that of
+    the chord's middle, beside the turn rate.
 
     Raises:
         InvalidInputError: wrong frame, or a motion that the needle cannot make: out of the plane, or a turn
             apart from that which the tip's velocity amounts to.
     """
-    require_dish_frame(message.header.frame_id, field)
     linear, angular = message.twist.linear, message.twist.angular
-    others = [linear.z, angular.x, angular.y, angular.z]
+    if message.header.frame_id == interface.NEEDLE_FRAME:
+        others, turn = [linear.z, angular.x, angular.y], [angular.z]
+    else:
+        require_dish_frame(message.header.frame_id, field)
+        others, turn = [linear.z, angular.x, angular.y, angular.z], []
     if any(value != 0.0 for value in others):
-        raise InvalidInputError(f"{field}.twist", f"linear.z, angular = {others}", "zeros: x and y alone count")
-    return np.array([linear.x, linear.y])
+        raise InvalidInputError(f"{field}.twist", f"out of the plane or apart from x and y: {others}", "zeros")
+    return np.array([linear.x, linear.y, *turn])
 
 
 def plane_point(message: Any, field: str) -> Vector:

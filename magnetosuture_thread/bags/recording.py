@@ -73,6 +73,7 @@ class Recording:
         self.counts: Counter[str] = Counter()
         self._bag = bag
         self._dish_frame = dish_frame.lstrip("/")
+        self._needle_frame = f"{self._dish_frame[: self._dish_frame.rfind('/') + 1]}needle"
         self._transforms: TransformTree | None = None
         self._topics: dict[Channel, str] = {}
         for channel in (value for value in vars(interface).values() if isinstance(value, Channel)):
@@ -176,6 +177,10 @@ class Recording:
         except BagError as error:
             raise UnfitError(error.problem) from None
         frame = frame.lstrip("/")
+        if is_ours and record.type_name == TWIST and frame == self._needle_frame:
+            message.header.frame_id = interface.NEEDLE_FRAME
+            data = bytes(typestore().serialize_cdr(message, record.type_name))
+            return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
         matrix = None if frame == self._dish_frame else self._transform_to_dish(record.topic, frame, stamp)
         try:
             data = converted(message, channel.type_name, stamp, matrix)

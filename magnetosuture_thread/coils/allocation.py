@@ -16,17 +16,15 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.field import LoopCoils
 from magnetosuture_thread.coils.filter import SPEED, NeedleSafetyFilter
 from magnetosuture_thread.coils.inputs import Pose
-from magnetosuture_thread.coils.motion_observer import MotionDisturbance
-from magnetosuture_thread.coils.needle_motion import NeedleKinematics
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist
 
 Vector = NDArray[np.float64]
 
 # Weights of the least-squares objectives; that of velocity and drift, which cannot be avoided everywhere, is 1.
-ALIGN_WEIGHT = 0.1
-# Where a pull across the needle is compensated. The aligning field's own gradient pulls across the needle too: at
-# headings close to a coil's axis both cannot be had, and a needle that drifts cannot be steered. In a field against it
-# the needle would turn round: the least field along it is a constraint, by its weight.
-COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT = 0.01, 10.0
+# The aligning field's own gradient pulls across the needle: at headings close to a coil's axis both cannot be had, and
+# a needle that drifts cannot be steered. In a field against it the needle would turn round: the least field along it is
+# a constraint, by its weight.
+ALIGN_WEIGHT, TURN_WEIGHT = 0.01, 10.0
 MIN_ALIGNING_SHARE, CONSTRAINT_WEIGHT = 0.4, 100.0
 CURRENT_WEIGHT = 1e-3
 
@@ -45,7 +43,7 @@ MAX_CHANGE = 0.2  # of a gain
 DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
 DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and of its shape against a straight one
 TORQUE_TIME = 1.0  # s; in which the thread's torque on the needle changes, as a thread is led around a turn
-MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
+BISECTIONS = 7  # of the certified share: to 1 %, and never beyond it
 
 
 @dataclass(frozen=True)
@@ -189,81 +187,76 @@ class CoilAllocation:
 
     def allocate(
         self,
-        velocity: Vector,
+        twist: NeedleTwist,
         tail: Vector,
         heading: Vector,
         previous: Vector | None = None,
         max_change: float = math.inf,
-        disturbance: MotionDisturbance | None = None,
         age: float = 0.0,
+        *,
+        at_tip: bool = False,
     ) -> Allocation:
-        """Return the currents for a tip velocity.
+        """Return the currents for a motion of the needle; for none, those that hold its direction.
 
         Args:
-            velocity: of the tip, shape (2,) [m/s].
+            twist: that the currents are to give.
             tail: the needle's tail, shape (2,) [m].
             heading: unit vector along the needle at its tail, shape (2,).
             previous: currents of the last step, shape (m,) [A]; no limit on change if None.
-            max_change: maximum change of each current [A]; not applied to a zero velocity.
-            disturbance: measured; the currents give the opposite of its drift and turn the field by the opposite of its
-                angle, while `velocity` holds the rest. None where nothing is measured.
+            max_change: maximum change of each current [A].
             age: time since the pose was measured [s].
+            at_tip: whether the tip is to move as it would by that motion: then the needle turns against what the
+                currents add across it. Else it turns as it is told, whatever they add.
         """
-        if not np.any(velocity):
-            return self.zero()
         needle = self._needle
         e = needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])
         lever = 0.5 * needle.chord
         middle = tail + lever * e
-        along, drifting, across_field, along_field = self._rows(middle, e)
+        along, across, across_field, along_field = self._rows(middle, e)
         turning = lever * needle.pole * needle.chord / needle.turning_drag * across_field
         # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
-        # Where drift is to be compensated, the needle turns as commanded also where it slips all the same.
-        to_turn, drift = (turning + drifting, 0.0) if disturbance is None else (turning, disturbance.drift)
-        sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n) + drift))
-        reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
-        effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
-        align_weight, turn_weight = ALIGN_WEIGHT, MAX_FIELD_ANGLE_SINE / max_turn_speed
-        if disturbance is not None:
-            align_weight, turn_weight = COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT * turn_weight
-            # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
-            # the needle takes large currents whose fields cancel each other, and their errors do not.
-            turned = lever / CORRECTION_TIME * across_field / (MIN_ALIGNING_SHARE * self._field)
-            # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
-            growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
-            error = HEADING_ERROR * math.exp(growth)
-            beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
-            misaligned = error / HEADING_STEP * (self._rows(middle, beside)[1] - drifting)
-            effort = np.hypot(effort, COIL_ERROR / reference_speed * np.hypot(drifting, turned))
+        turned = min(max_turn_speed, max(-max_turn_speed, lever * twist.turn_rate))
+        # From the field at one pole alone: velocities count by the force that they take.
+        along_speed, across_speed = (needle.pole * self._field / drag for drag in (needle.drag, needle.drag_across))
+        turn_weight = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
+        # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
+        # the needle takes large currents whose fields cancel each other, and their errors do not.
+        swung = lever / CORRECTION_TIME * across_field / (MIN_ALIGNING_SHARE * self._field)
+        effort = np.hypot(CURRENT_WEIGHT / self._max_current, COIL_ERROR / across_speed * np.hypot(across, swung))
+        # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
+        growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
+        beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
+        misaligned = HEADING_ERROR * math.exp(growth) / HEADING_STEP * (self._rows(middle, beside)[1] - across)
         system = np.vstack(
             [
-                along / reference_speed,
-                turn_weight * to_turn,
-                align_weight / self._field * along_field,
-                drifting / reference_speed,
-                misaligned / reference_speed,
+                along / along_speed,
+                turn_weight * (turning + across if at_tip else turning),
+                ALIGN_WEIGHT / self._field * along_field,
+                across / across_speed,
+                misaligned / across_speed,
                 np.diag(effort),
             ]
         )
         target = np.zeros(len(system))
-        target[0], target[3] = float(velocity @ e) / reference_speed, -drift / reference_speed
-        target[1:3] = turn_weight * sideways, align_weight
+        target[:4] = twist.along / along_speed, turn_weight * turned, ALIGN_WEIGHT, twist.across / across_speed
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
             lower, upper = (np.clip(previous + change, -limit, limit) for change in (-max_change, max_change))
         currents = self._bounded_least_squares(system, target, lower, upper)
-        if disturbance is not None and along_field @ currents < MIN_ALIGNING_SHARE * self._field:
+        if along_field @ currents < MIN_ALIGNING_SHARE * self._field:
             # A constraint that the optimum violates is active in the constrained optimum.
             system[2] = CONSTRAINT_WEIGHT / self._field * along_field
             target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
             currents = self._bounded_least_squares(system, target, lower, upper)
-        reached = float(along @ currents) * e + float((turning + drifting) @ currents) * n
-        inaccurate = math.hypot(*(reached - velocity)) > SATURATION_TOLERANCE * math.hypot(*velocity)
+        drift = float(across @ currents)
+        reached = float(along @ currents) * e + (float(turning @ currents) + drift) * n
+        wanted = twist.along * e + (lever * twist.turn_rate + twist.across) * n
+        inaccurate = math.hypot(*(reached - wanted)) > SATURATION_TOLERANCE * math.hypot(*wanted)
         saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
-        return Allocation(currents, reached, saturated, float(drifting @ currents))
+        return Allocation(currents, reached, saturated, drift)
 
     def _rows(self, middle: Vector, e: Vector) -> Vector:
         """Return what one ampere in each coil gives a needle with its chord along e, shape (4, m).
@@ -419,16 +412,14 @@ class CoilGainEstimator:
 
 
 class CertifiedAllocation:
-    """Allocates currents for a velocity, and reduces them until their motion is certified for the hold time.
+    """Allocates currents for a motion of the needle against a pull, as far as that is certified for the hold time.
 
-    The motion that is certified is that of the currents and of the measured disturbance. Where it is not, as much of
-    the velocity is taken as is, while the currents against the disturbance stay, as far as they are certified without
-    it. Where no currents hold the needle against the disturbance, as on a coil's axis, and that alone is not certified,
-    the velocity is certified by itself: else none would be, not even one along the shape or off the axis. Where nothing
-    is known of a disturbance, all currents are scaled by the certified share.
+    With the currents I of the motion that is wanted, and I_hold of those that keep the needle in its place,
 
-    A needle cannot turn away from what it lies along, as its other end would come closer. Where a disturbance is
-    measured, the currents therefore take it off sideways by their force across it, see `NeedleSafetyFilter.sidestep`.
+        I_hold + s (I - I_hold)    with the greatest s, 0 to 1, whose motion is certified together with the pull
+
+    Where even I_hold is not, as no currents keep the needle there, I - I_hold is certified by itself: else the needle
+    could not be turned to where there are. Without a pull I_hold is zero.
 
     Args:
         coils: allocate the currents.
@@ -436,95 +427,56 @@ class CertifiedAllocation:
     """
 
     def __init__(self, coils: CoilAllocation, max_speed: float) -> None:
-        self._coils = coils
-        self._max_speed = max_speed
+        self._coils, self._max_speed = coils, max_speed
 
     def allocate(
         self,
-        velocity: Vector,
+        twist: NeedleTwist,
         pose: Pose,
         safety: NeedleSafetyFilter,
         previous: Allocation,
         max_change: float,
-        disturbance: MotionDisturbance | None,
-        max_sidestep: float = 0.0,
+        pull: NeedleTwist | None,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.
 
         Args:
-            velocity: filtered, of the tip, shape (2,) [m/s].
+            twist: that the needle is to have.
             pose: of the needle now.
             safety: certifies motions.
             previous: of the last step.
             max_change: maximum change of each current [A].
-            disturbance: measured, which the currents compensate; None where nothing is measured.
-            max_sidestep: at which the needle may be taken off sideways; never where nothing is measured [m/s].
+            pull: motion that something else gives the needle; None where that is not measured.
         """
-        if disturbance is None:
-            return self._allocate(velocity, pose, safety, previous, max_change, None, 0.0)
-        sidestep = min(max_sidestep, max(-max_sidestep, safety.sidestep(pose.tail, pose.heading)))
-        disturbed = disturbance.velocity(safety.kinematics.chord_direction(pose.heading))
-        best, max_share = (self._coils.zero(), ""), -1.0
-        for step in (sidestep, 0.0) if sidestep else (0.0,):
-            found = self._allocate(velocity, pose, safety, previous, max_change, disturbance, step)
-            motion, drift = found[0].velocity + disturbed, found[0].drift + disturbance.drift
-            share, _ = safety.safe_share(motion, pose.tail, pose.heading, drift)
-            if share > max_share:
-                best, max_share = found, share
-            if share >= MIN_SHARE:
-                break  # else it may be the step that brings the needle too close to something else
-        return best
+        at = pose.tail, pose.heading
 
-    def _allocate(
-        self,
-        velocity: Vector,
-        pose: Pose,
-        safety: NeedleSafetyFilter,
-        previous: Allocation,
-        max_change: float,
-        disturbance: MotionDisturbance | None,
-        sidestep: float,
-    ) -> tuple[Allocation, str]:
-        """Return currents for a velocity of the tip, and of the whole needle across its chord; see `allocate`."""
-        disturbed, aside, to_compensate = np.zeros(2), np.zeros(2), disturbance
-        if disturbance is not None:
-            e = safety.kinematics.chord_direction(pose.heading)
-            disturbed, aside = disturbance.velocity(e), sidestep * np.array([-e[1], e[0]])
-            to_compensate = disturbance._replace(drift=disturbance.drift - sidestep)
-        velocity = velocity + aside - disturbed
-
-        def certified(found: Allocation, added: Vector) -> tuple[float, str]:
-            drift = 0.0 if disturbance is None else found.drift + disturbance.drift
-            return safety.safe_share(found.velocity + added, pose.tail, pose.heading, drift)
-
-        def allocated(target: Vector) -> tuple[Allocation, str]:
-            found = self._coils.allocate(
-                target, pose.tail, pose.heading, previous.currents, max_change, to_compensate, pose.age
+        def allocated(wanted: NeedleTwist) -> tuple[Allocation, str]:
+            against = wanted.less(pull) if pull else wanted
+            allocation = self._coils.allocate(
+                against, *at, previous.currents, max_change, pose.age, at_tip=pull is None
             )
-            speed = self._coils.slack_speed(found, pose.heading)
-            return (found.scaled(self._max_speed / speed), SPEED) if speed > self._max_speed else (found, "")
+            speed = self._coils.slack_speed(allocation, pose.heading)
+            return (allocation.scaled(self._max_speed / speed), SPEED) if speed > self._max_speed else (allocation, "")
 
-        target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
-        resting: Allocation | None = None  # against the disturbance alone
-        # The drift that the coils add to a velocity towards the wall is corrected four times at the most.
-        for _ in range(1 + 4):
-            found, bound = allocated(target)
-            share, name = certified(found, disturbed)
-            name = name or bound
-            kept, turning = found.scaled(share), found.velocity + disturbed - aside
-            if share < 1.0 and disturbance is not None:
-                resting = resting or allocated(aside - disturbed)[0]
-                if certified(resting, disturbed)[0] < 1.0:
-                    turning, drift = found.velocity - resting.velocity, found.drift - resting.drift
-                    share, name = safety.safe_share(turning, pose.tail, pose.heading, drift)
-                kept = resting.towards(found, share)
-                own, _ = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
-                kept = kept.scaled(own)
-            error = math.hypot(*(kept.velocity - velocity))
-            if error < min_error:
-                best, min_error, limiting = kept, error, name
-            if share >= MIN_SHARE:
-                break
-            clear, _ = safety.nearest_clear(turning, pose.tail, pose.heading)
-            target = target - (turning - clear)
-        return best, limiting
+        def certified(allocation: Allocation) -> tuple[float, str]:
+            if pull is None:
+                return safety.safe_share(allocation.velocity, *at)  # its drift counts as a part of the turn
+            velocity = allocation.velocity + safety.kinematics.tip_velocity(pose.heading, pull)
+            return safety.safe_share(velocity, *at, allocation.drift + pull.across)
+
+        drive, bound = allocated(twist)
+        share, name = certified(drive)
+        if share >= 1.0:
+            return drive, bound
+        if pull is None:
+            return drive.scaled(share), name
+        hold, _ = allocated(NeedleTwist())
+        if certified(hold)[0] < 1.0:
+            added = drive.velocity - hold.velocity
+            share, by_itself = safety.safe_share(added, *at, drive.drift - hold.drift)
+            return hold.towards(drive, share), by_itself or name
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if certified(hold.towards(drive, middle))[0] >= 1.0 else (low, middle)
+        return hold.towards(drive, low), name

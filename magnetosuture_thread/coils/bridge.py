@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,19 +11,18 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation
 from magnetosuture_thread.coils.drivers import DriverState
-from magnetosuture_thread.coils.filter import SPEED, NeedleSafetyFilter, rest_reason
+from magnetosuture_thread.coils.filter import FRICTION, SPEED, NeedleSafetyFilter, rest_reason
 from magnetosuture_thread.coils.inputs import (
     CONSISTENT_POSES,
     TOPIC,
     CommandWatchdog,
-    Pose,
     PoseExtrapolator,
     PredictionMonitor,
     StampAges,
 )
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionDisturbance, MotionObserver
-from magnetosuture_thread.coils.needle_motion import STUCK
+from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionObserver
+from magnetosuture_thread.coils.needle_motion import STUCK, NeedleTwist
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.errors import InvalidInputError, shortened
@@ -36,6 +35,10 @@ INPUTS = {OPERATOR: "operator/servo_cv", NEEDLE: "needle/servo_cv"}  # topics, b
 LOOKAHEAD_PERIODS = 2.0  # in which command and pose must stay valid: one to the next step, one to the boards
 NO_SCENE, NO_POSE = "no scene", "no needle pose"
 NO_PREDICTION, CURRENT_LIMIT = "no prediction", "current"  # constraints of the bridge, besides those of the filter
+
+
+NO_VELOCITY: Vector = np.zeros(2)
+NO_VELOCITY.flags.writeable = False  # shared by all steps without a command
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class BridgeOutput:
         slowdown: factor on the speed by the thread's friction.
         active: names of the constraints that changed the command.
         scene_version: of the scene that the needle is kept within; empty for none.
-        drift: velocity of the needle across its chord, to the left, that is measured and compensated [m/s].
+        pull: velocity that the thread's pull gives the needle, measured and compensated, shape (2,) [m/s].
     """
 
     coils: tuple[str, ...]
@@ -68,7 +71,7 @@ class BridgeOutput:
     slowdown: float = 1.0
     active: tuple[str, ...] = ()
     scene_version: str = ""
-    drift: float = 0.0
+    pull: Vector = field(default_factory=lambda: NO_VELOCITY)
 
     @property
     def applied(self) -> Vector:
@@ -81,17 +84,22 @@ class BridgeOutput:
         return "; ".join(self.reasons)
 
 
-NO_VELOCITY: Vector = np.zeros(2)
-NO_VELOCITY.flags.writeable = False  # shared by all steps without a command
-
-
 class _SelectedInput(NamedTuple):
-    """The input that is followed, or why there is none."""
+    """The input that is followed, or why there is none.
+
+    Attributes:
+        source: of the command; empty for none.
+        overridden: input whose valid commands are overridden.
+        command: velocity of the tip, shape (2,) [m/s], or the motion of the needle, shape (3,), see `NeedleTwist`.
+        problem: why there is no command.
+        tip: velocity of the tip that is commanded, shape (2,) [m/s].
+    """
 
     source: str = ""
     overridden: str = ""
-    velocity: Vector = NO_VELOCITY
+    command: Vector = NO_VELOCITY
     problem: str = ""
+    tip: Vector = NO_VELOCITY
 
 
 class CoilBridge:
@@ -139,7 +147,7 @@ class CoilBridge:
             max_hold=settings.hold_time,
         )
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
-        self._observer = MotionObserver(kinematics, self._hold, settings.max_speed)
+        self._observer = MotionObserver(kinematics, self._hold, settings.max_speed, settings.pose_timeout)
         slack_ratio = needle.drag / needle.slack_drag
         self._follow = FollowMonitor(settings.pose_uncertainty, slack_ratio)
         self._settings, self._gains, self._allocation = settings, settings.gain_estimator(), settings.allocation()
@@ -181,19 +189,20 @@ class CoilBridge:
         self._observer.rest(now)
         self.extrapolator.apply_velocity(self._velocity, now, arrival)
 
-    def command(self, source: str, velocity: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
+    def command(self, source: str, command: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
         """Register a command of an input; see `CommandWatchdog.update`.
 
         Args:
             source: the input, "operator" or "needle".
-            velocity: of the needle's tip in the dish plane, shape (2,) [m/s].
+            command: velocity of the needle's tip in the dish plane, shape (2,) [m/s], or the motion of the needle in
+                its own frame, shape (3,), see `NeedleTwist`.
             stamp: when it was made [s].
             number: of the message, counted by its publisher.
             now: the same clock now [s].
             arrival: a monotonic clock now [s].
         """
         self.stamp_ages.add(INPUTS[source], now - stamp, arrival)
-        self.watchdogs[source].update(velocity, stamp, number, now, arrival)
+        self.watchdogs[source].update(command, stamp, number, now, arrival)
 
     def on_pose(
         self,
@@ -213,7 +222,7 @@ class CoilBridge:
             if self.latch.armed and self.extrapolator.rejections >= CONSISTENT_POSES:
                 self.latch.trip(f"needle does not follow: {self.extrapolator.rejection}")
             raise
-        motion = self._observer.update(tail, heading, stamp, self._follow.is_trusted(stamp))
+        motion = self._observer.update(tail, heading, stamp)
         if motion is not None and self.latch.armed and self._filter is not None:
             at_shape = self._filter.clearance(tail, heading) < self._filter.keep_out
             if problem := self._follow.update(motion, at_shape):
@@ -288,9 +297,9 @@ class CoilBridge:
             self._follow.end_probe()
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
             return self._zero_output(now, arrival, selected, reasons, active)
-        if self._follow.probe_rate and selected.velocity.any():
-            selected = selected._replace(velocity=self._probe_velocity(pose))
-        if not selected.velocity.any():
+        if self._follow.probe_rate and selected.command.any():
+            selected = selected._replace(command=np.array([0.0, 0.0, self._follow.probe_rate]))
+        if not selected.command.any():
             self._follow.end_probe()
             output, self._stopped = replace(self._zero_output(now, arrival, selected, ()), publish=True), None
             return output
@@ -298,58 +307,65 @@ class CoilBridge:
         max_speed = min(settings.max_speed, settings.speed_without_prediction if no_prediction else math.inf)
         # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
         slowed = selected.source == OPERATOR or settings.friction_feedback == "all"
-        filtered = self._filter.filter(
-            selected.velocity,
-            pose.tail,
-            pose.heading,
-            slowdown=self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0,
-            max_speed=max_speed,
-            previous=self._velocity,
-            elapsed=elapsed,
-            time=now,
-            first_time=self.extrapolator.first_stamp,
-        )
-        active += filtered.active
-        if filtered.reason and not compensates:
-            return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered.slowdown)
+        slowdown = self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0
+        kinematics, pull = self._needle.kinematics, self._observer.pull(pose.heading) if compensates else None
+        if len(selected.command) == 3:
+            commanded = NeedleTwist(*selected.command.tolist())
+            tip = kinematics.tip_velocity(pose.heading, commanded)
+            selected = selected._replace(tip=tip)
+            swiftest = max(math.hypot(*tip), math.hypot(commanded.along, commanded.across))
+            limited = min(slowdown, max_speed / swiftest)
+            twist, wanted = commanded.scaled(limited), limited * tip
+            active += tuple(filter(None, (FRICTION if slowdown < 1.0 else "", SPEED if limited < slowdown else "")))
+        else:
+            selected = selected._replace(tip=selected.command)
+            filtered = self._filter.filter(
+                selected.command,
+                pose.tail,
+                pose.heading,
+                slowdown=slowdown,
+                max_speed=max_speed,
+                previous=self._velocity,
+                elapsed=elapsed,
+                time=now,
+                first_time=self.extrapolator.first_stamp,
+            )
+            active += filtered.active
+            if filtered.reason and not compensates:
+                return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered.slowdown)
+            wanted, aside = filtered.filtered, 0.0
+            if compensates:
+                room = min(slowdown * math.hypot(*selected.command), max_speed - math.hypot(*wanted))
+                room = max(0.0, room)  # while the needle slows down to another limit it is still faster
+                aside = min(room, max(-room, self._filter.sidestep(pose.tail, pose.heading)))
+            twist = kinematics.twist(pose.heading, wanted)._replace(across=aside)
         max_change = settings.max_current_slew * elapsed
-        disturbance = self._observer.disturbance(pose.heading) if compensates else None
-        sidestep = min(filtered.slowdown * math.hypot(*selected.velocity), max_speed - math.hypot(*filtered.filtered))
-        sidestep = max(0.0, sidestep)  # while the needle slows down to another limit it is still faster
-        allocation, limiting = self._coils.allocate(
-            filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, sidestep
-        )
-        e = self._needle.chord_direction(pose.heading)
+        allocation, limiting = self._coils.allocate(twist, pose, self._filter, self._previous, max_change, pull)
         limits = limiting, CURRENT_LIMIT if allocation.saturated else ""
         active += tuple(name for name in limits if name and name not in active)
-        measured = MotionDisturbance() if disturbance is None else disturbance
-        expected = allocation.velocity + measured.velocity(e)
+        pulled = NeedleTwist() if pull is None else pull
+        expected = allocation.velocity + kinematics.tip_velocity(pose.heading, pulled)
         own_drift = allocation.drift if compensates else 0.0  # else it counts as part of the turn
-        drift = own_drift + measured.drift
-        is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*filtered.filtered)
+        is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*wanted)
         # A needle that is pulled is held by currents where it may not go on.
         # With less than 0.1 mA in each coil the needle is at rest, which needs a reason.
         if (is_stuck and not compensates) or np.abs(allocation.currents).max() < 1e-4:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
-            return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered.slowdown)
-        self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
-        self.extrapolator.apply_velocity(expected, now, arrival, drift)
+            return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, slowdown)
+        self._previous, self._velocity, self._stopped = allocation, wanted, None
+        self.extrapolator.apply_velocity(expected, now, arrival, own_drift + pulled.across)
+        given = kinematics.twist(pose.heading, allocation.velocity, own_drift)
+        e = kinematics.chord_direction(pose.heading)
         n = np.array([-e[1], e[0]])
-        applied = float(e @ allocation.velocity) * e + own_drift * n
-        # Where the force that is allowed does not suffice, what was intended is the filtered velocity.
-        intended = float(e @ filtered.filtered) * e if limiting == SPEED else applied + self._observer.velocity
-        turn_rate = 2.0 / self.extrapolator.chord * (float(n @ allocation.velocity) - own_drift)
-        self._observer.apply(now, applied, intended, turn_rate)
-        self._follow.register_turn(turn_rate * period)
+        applied = given.along * e + own_drift * n
+        # Where the force that is allowed does not suffice, what was intended is the wanted velocity.
+        intended = twist.along * e + twist.across * n if limiting == SPEED else applied + self._observer.velocity
+        self._observer.apply(now, applied, intended, given.turn_rate)
+        self._follow.register_turn(given.turn_rate * period)
         if compensates:
             self._gains.apply(now, allocation.currents)
-        return self._output(selected, (), active, filtered.slowdown, measured.drift)
-
-    def _probe_velocity(self, pose: Pose) -> Vector:
-        """Return the tip velocity that turns the needle to see whether it follows, shape (2,) [m/s]."""
-        x, y = self._needle.chord_direction(pose.heading).tolist()
-        return 0.5 * self.extrapolator.chord * self._follow.probe_rate * np.array([-y, x])
+        return self._output(selected, (), active, slowdown, self._observer.velocity if compensates else NO_VELOCITY)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""
@@ -409,12 +425,12 @@ class CoilBridge:
         reasons: tuple[str, ...],
         active: tuple[str, ...] = (),
         slowdown: float = 1.0,
-        drift: float = 0.0,
+        pull: Vector = NO_VELOCITY,
     ) -> BridgeOutput:
         """Return the result of a step with the currents and the filtered velocity that it has ended with."""
-        source, overridden, velocity, _ = selected
-        fixed = (self.coils, self._previous, velocity, self._velocity, reasons, True, source, overridden)
-        return BridgeOutput(*fixed, slowdown, active, self.scene_version, drift)
+        source, overridden, _, _, tip = selected
+        fixed = (self.coils, self._previous, tip, self._velocity, reasons, True, source, overridden)
+        return BridgeOutput(*fixed, slowdown, active, self.scene_version, pull)
 
     def _clear(self) -> None:
         """Restart the limits on change from zero current and velocity."""

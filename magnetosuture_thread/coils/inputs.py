@@ -166,7 +166,7 @@ class CommandWatchdog:
         """Accept a command, or reject it and keep the last one until that is stale.
 
         Args:
-            velocity: of the needle's tip in the dish plane, shape (2,) [m/s].
+            velocity: see `CoilBridge.command`.
             stamp: when it was made [s].
             number: of the message, counted by its publisher.
             now: the same clock now [s].
@@ -176,7 +176,7 @@ class CommandWatchdog:
             InvalidInputError: the command is not finite, too old, from the future, older than the last one, or
                 there are several publishers.
         """
-        self._check.update(velocity, "twist.linear", "finite numbers [m/s]", stamp, number, now, arrival)
+        self._check.update(velocity, "twist", "finite numbers", stamp, number, now, arrival)
         self._velocity, self._arrival = np.array(velocity, dtype=np.float64), arrival
 
     def clear(self) -> None:
@@ -185,7 +185,7 @@ class CommandWatchdog:
 
     @property
     def velocity(self) -> Vector:
-        """The last valid command, shape (2,) [m/s]."""
+        """The last valid command, see `CoilBridge.command`."""
         return self._velocity
 
     @property

@@ -1,4 +1,4 @@
-"""The measured motion of the needle: what its currents do not explain, and whether it follows them."""
+"""The measured motion of the needle: what pulls it beside its currents, and whether it follows them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.needle_motion import NeedleKinematics, limit_pair
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist, limit_pair
 
 Vector = NDArray[np.float64]
 
-GAIN = 12.0  # 1/s; of the velocities, below the rate of a camera's poses
-MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
+PLACE_DEVIATION = 1.2e-5  # m; of a tracked middle
+PULL_NOISE = 1e-4  # m^2/s^3; a pull changes by 10 mm/s, root mean square, in 1 s
 MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
-VISIBLE = 6e-5  # m; four times the noise of a displacement between two poses
 MIN_WINDOW = 0.15  # s; two time constants of the motion observer, in which it compensates a pull that has changed
 MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
 MIN_DISTANCE = 2e-4  # m; ten times the noise of a measured pose
@@ -28,97 +27,91 @@ PROBE_TURN, PROBE_RATE = 0.2, 4.0  # rad, forty times the noise of a heading, an
 PROBE_SHARE = 0.2  # of a turn of the field, which the needle makes at least
 PROBE_TIMEOUT = 0.4  # s; a needle that could not be turned by then does not follow
 MAX_ERROR, MAX_ERROR_SHARE = 2.0, 0.8  # of d and of the expected displacement, while a pull is learnt that has changed
-TRUST_TIME = 1.0  # s after a probe that the needle has followed
-
-
-class MotionDisturbance(NamedTuple):
-    """Motion of the needle that its currents do not explain.
-
-    Attributes:
-        along: velocity of the whole needle along its chord [m/s].
-        drift: velocity of the whole needle across its chord, to the left [m/s].
-    """
-
-    along: float = 0.0
-    drift: float = 0.0
-
-    def velocity(self, e: Vector) -> Vector:
-        """Return the velocity of the whole needle for the unit vector from tail to tip, shapes (2,) [m/s]."""
-        return np.array([self.along * e[0] - self.drift * e[1], self.along * e[1] + self.drift * e[0]])
 
 
 class MotionObserver:
-    """Estimates the needle's motion that its currents, by the bridge's model of coils and needle, do not explain.
+    """Estimates the velocity that the thread's pull gives the needle, beside what its currents give it by the model.
 
-    A thread that trails at an angle pulls the needle aside, and a longer one slows it. With the velocity m of the
-    needle's middle along and across its chord, measured by two poses, and the mean c of the velocity by the currents
-    between the times of these poses, the estimate d follows by
+    A Kalman filter of the place p of the chord's middle and of that velocity d, in the dish's frame. Between two poses,
+    T apart, with the mean c of the velocity by the currents,
 
-        d' = g (m - c - d),    |d| <= max_speed
+        p' = p + T (c + d),    d' = d + noise,    var = PULL_NOISE T;    p is measured with PLACE_DEVIATION
 
-    It learns only from motion that can be seen: poses are compared once the middle has moved by `VISIBLE`, or while no
-    currents are on, or while the needle is trusted to be tracked. Poses that stand still thus wind up nothing.
+    d is at most `max_speed`. The coils compensate d: for the motion u they are set to c = u - d. Where the needle moves
+    at k c, d converges with poses up to 0.4 s late for k from 0.5 to 1.5, so the drag of the model is the needle's own:
+    that of the thread is a part of the pull.
 
-    The coils compensate d: with a commanded velocity u, c = u - d. Of a needle that moves at k c, d converges at any
-    lateness of the poses where |k - 1| < 1, and at k = 2 at up to 0.2 s.
-
-    Source: disturbance observers of first order, Ohnishi, Shibata and Murakami 1996. Deviation: of velocities, not of
-    forces, as inertia has no part. Pure: times come in, in seconds.
+    Source: the Kalman filter of a constant disturbance. Deviation: d is bounded. Pure: times come in, in seconds.
 
     Args:
         needle: its kinematics.
         min_hold: the coils hold their currents for at least this long; for how much longer is not known [s].
-        max_speed: of the disturbance that is compensated [m/s].
+        max_speed: of the pull that is compensated [m/s].
+        max_interval: two poses farther apart say nothing of whether the needle follows [s].
     """
 
-    def __init__(self, needle: NeedleKinematics, min_hold: float = math.inf, max_speed: float = math.inf) -> None:
-        self._needle, self._min_hold, self._max_speed = needle, min_hold, max_speed
-        limit_pair(0.0, 0.0, max_speed)  # loaded now, and not within the loop
-        self._velocity = np.zeros(2)
+    def __init__(
+        self,
+        needle: NeedleKinematics,
+        min_hold: float = math.inf,
+        max_speed: float = math.inf,
+        max_interval: float = MAX_GAP,
+    ) -> None:
+        self._needle, self._min_hold, self._max_speed, self._max_interval = needle, min_hold, max_speed, max_interval
+        self._place, self._velocity, self._covariance = np.zeros(2), np.zeros(2), np.zeros((2, 2))
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
-        self._seen: tuple[float, Vector] | None = None  # the last pose that the needle has visibly moved to
         self._applied: deque[tuple[float, Vector]] = deque()  # what the currents were set for, each with its start
 
     @property
     def velocity(self) -> Vector:
-        """The disturbance in the dish's frame, shape (2,) [m/s]."""
+        """The velocity d in the dish's frame, shape (2,) [m/s]."""
         return self._velocity
 
-    def update(self, tail: Vector, heading: Vector, stamp: float, trusted: bool = False) -> MotionStep | None:
-        """Take a measured pose; return the motion since the last one, None where it cannot be compared.
+    def pull(self, heading: Vector) -> NeedleTwist:
+        """Return d as the motion of a needle with a heading, a unit vector at its tail of shape (2,)."""
+        (ex, ey), (x, y) = self._needle.chord_direction(heading), self._velocity
+        return NeedleTwist(float(ex * x + ey * y), float(ex * y - ey * x), 0.0)
+
+    def update(self, tail: Vector, heading: Vector, stamp: float) -> MotionStep | None:
+        """Update with a measured pose; return the motion since the last one, None where it cannot be compared.
 
         Args:
             tail: shape (2,) [m].
             heading: unit vector at the tail, shape (2,).
             stamp: when it was measured [s].
-            trusted: whether to learn also from a needle that stands still.
         """
         e = self._needle.chord_direction(heading)
         middle = tail + 0.5 * self._needle.chord * e
         last, self._last = self._last, (stamp, middle, e)
-        seen = self._seen
-        if seen is None or not 0.0 < stamp - seen[0] <= MAX_INTERVAL:
-            if last is None or not 0.0 < stamp - last[0] <= MAX_GAP:
+        interval = math.inf if last is None else stamp - last[0]
+        known = 0.0 < interval <= MAX_GAP
+        applied = self._mean_applied(stamp - interval, stamp) if known else None
+        if last is None or applied is None:
+            self._place, self._covariance = middle, np.diag([PLACE_DEVIATION**2, PULL_NOISE * MAX_GAP])
+            if not known:
                 self._velocity = np.zeros(2)
-            seen = self._seen = stamp, middle
-        elif (applied := self._mean_applied(seen[0], stamp)) is not None:
-            interval = stamp - seen[0]
-            if trusted or not applied[:2].any() or math.hypot(*(middle - seen[1])) > VISIBLE:
-                unexplained = (middle - seen[1]) / interval - applied[:2]
-                learnt = self._velocity + min(1.0, GAIN * interval) * (unexplained - self._velocity)
-                self._velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
-                self._seen = stamp, middle
-        if last is None or not 0.0 < stamp - last[0] <= MAX_INTERVAL:
             return None
-        applied = self._mean_applied(last[0], stamp)
-        if applied is None:
+        self._predict(interval, applied[:2])
+        innovation = middle - self._place
+        gain = self._covariance[0] / (self._covariance[0, 0] + PLACE_DEVIATION**2)
+        self._covariance = self._covariance - np.outer(gain, self._covariance[0])
+        self._place = self._place + gain[0] * innovation
+        learnt = self._velocity + gain[1] * innovation
+        self._velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
+        if interval > self._max_interval:
             return None
-        interval, before = stamp - last[0], last[2]
+        before = last[2]
         turn = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
         swing = 0.5 * self._needle.chord * (e - before)
         return MotionStep(
             stamp, interval, interval * applied[2:4], interval * applied[4], middle - last[1], turn, swing
         )
+
+    def _predict(self, interval: float, applied: Vector) -> None:
+        self._place = self._place + interval * (applied + self._velocity)
+        step = np.array([[1.0, interval], [0.0, 1.0]])
+        noise = PULL_NOISE * np.array([[interval**3 / 3.0, interval**2 / 2.0], [interval**2 / 2.0, interval]])
+        self._covariance = step @ self._covariance @ step.T + noise
 
     def apply(self, now: float, applied: Vector, intended: Vector, turn_rate: float) -> None:
         """Register what currents are set for from a time on.
@@ -138,7 +131,7 @@ class MotionObserver:
     def _register(self, now: float, velocity: Vector) -> None:
         if self._applied and now < self._applied[-1][0]:
             self._applied.clear()  # time was set back
-            self._last = self._seen = None
+            self._last = None
         self._applied.append((now, velocity))
         while len(self._applied) > 1 and self._applied[1][0] < now - MAX_GAP:
             self._applied.popleft()
@@ -158,16 +151,6 @@ class MotionObserver:
             if since <= start:
                 break
         return total / (end - start)
-
-    def disturbance(self, heading: Vector) -> MotionDisturbance:
-        """Return what to compensate.
-
-        Args:
-            heading: unit vector at the tail, shape (2,).
-        """
-        e = self._needle.chord_direction(heading)
-        x, y = self._velocity
-        return MotionDisturbance(float(e[0] * x + e[1] * y), float(e[0] * y - e[1] * x))
 
 
 class MotionStep(NamedTuple):
@@ -224,7 +207,6 @@ class FollowMonitor:
         self._probed: float | None = None  # stamp of the pose that began the probe
         self._turned = 0.0  # by which the field was turned since
         self._direction = 1.0
-        self._trusted_until = -math.inf
         self._suspicion = ""
 
     def clear(self) -> None:
@@ -245,10 +227,6 @@ class FollowMonitor:
     def register_turn(self, angle: float) -> None:
         """Register by which angle the field was set to turn the needle [rad]."""
         self._turned += angle
-
-    def is_trusted(self, stamp: float) -> bool:
-        """Return whether a probe has lately shown that the poses are the needle's."""
-        return stamp <= self._trusted_until
 
     def update(self, step: MotionStep, at_shape: bool = False) -> str:
         """Take the motion between two poses; return why the needle does not follow, or an empty text.
@@ -324,7 +302,6 @@ class FollowMonitor:
         if measured * math.copysign(1.0, expected) < PROBE_SHARE * abs(expected):
             return self._suspicion
         self.clear()
-        self._trusted_until = stamp + TRUST_TIME
         return ""
 
 

@@ -70,6 +70,28 @@ def move_pose(
     pose[2], pose[3] = hx, hy
 
 
+class NeedleTwist(NamedTuple):
+    """Motion of the needle in its own frame: x along its chord from tail to tip, y to the left.
+
+    Attributes:
+        along: velocity of the chord's middle along the chord [m/s].
+        across: the same across it, to its left [m/s].
+        turn_rate: counter-clockwise [rad/s].
+    """
+
+    along: float = 0.0
+    across: float = 0.0
+    turn_rate: float = 0.0
+
+    def less(self, other: NeedleTwist) -> NeedleTwist:
+        """Return the motion that gives this one together with another."""
+        return NeedleTwist(self.along - other.along, self.across - other.across, self.turn_rate - other.turn_rate)
+
+    def scaled(self, factor: float) -> NeedleTwist:
+        """Return the same motion, slower or faster by a factor."""
+        return NeedleTwist(factor * self.along, factor * self.across, factor * self.turn_rate)
+
+
 @dataclass(frozen=True)
 class NeedleKinematics:
     """A needle that is driven along its chord and turned about the middle of it.
@@ -116,6 +138,18 @@ class NeedleKinematics:
         e = self.chord_direction(heading)
         x, y = float(velocity[0]), float(velocity[1])
         return float(e[0]) * x + float(e[1]) * y, float(e[0]) * y - float(e[1]) * x
+
+    def tip_velocity(self, heading: Vector, twist: NeedleTwist) -> Vector:
+        """Return the velocity of the tip under a motion, shape (2,) [m/s]."""
+        e, left = self.chord_direction(heading), twist.across + 0.5 * self.chord * twist.turn_rate
+        return np.array([twist.along * e[0] - left * e[1], twist.along * e[1] + left * e[0]])
+
+    def twist(self, heading: Vector, velocity: Vector, drift: float = 0.0) -> NeedleTwist:
+        """Return the motion under a tip velocity, of which a drift across the chord is of the whole needle [m/s]."""
+        along, left = self.body_velocity(heading, velocity)
+        if self.length == 0.0:
+            return NeedleTwist(along, left, 0.0)
+        return NeedleTwist(along, drift, (left - drift) / (0.5 * self.chord))
 
     def moved(
         self, tail: Vector, heading: Vector, along: float, across: float, duration: float, drift: float = 0.0

@@ -26,7 +26,6 @@ from magnetosuture_thread.settings.errors import ConfigurationError
 
 # Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
 MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}
-MAX_MOBILITY_RATIO = 2.0  # of a needle to that by its model, for a motion observer that is stable with late poses
 MAX_THREAD_SHARE = 0.9  # of needle_drag, where the motion is compensated
 MAX_BLIND_DISTANCE = 0.0125  # m; maximum distance of free motion within the hold time
 
@@ -177,13 +176,10 @@ class CoilBridgeSettings(
     def needle(self) -> NeedleMechanics:
         """Return the needle's mechanics.
 
-        A slack thread does not slow the needle down as a straight one does. Where the motion is compensated, the drag
-        is therefore at most `MAX_MOBILITY_RATIO` times that of the needle without a thread: the needle then moves at
-        most so many times as fast as by the model, and `MotionObserver` converges with poses up to 0.2 s late.
+        Where the motion is compensated, the drag is the needle's own: what a thread adds is a part of the pull that
+        `MotionObserver` estimates.
         """
-        drag = self.needle_drag
-        if self.motion_compensation:
-            drag = min(drag, MAX_MOBILITY_RATIO * (drag - self.thread_drag))
+        drag = self.needle_drag - self.thread_drag if self.motion_compensation else self.needle_drag
         return NeedleMechanics(
             self.needle_length,
             self.needle_curvature,

@@ -156,9 +156,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def on_command(self, source: str, message: TwistStamped, number: int) -> None:
         """Register a velocity command of an input, which the next step follows."""
         if self.system.bridge is not None:
-            velocity = reading.plane_velocity(message, INPUTS[source])
+            command = reading.needle_command(message, INPUTS[source])
             stamp = reading.checked_nanoseconds(message.header.stamp, f"{INPUTS[source]}.header.stamp") * 1e-9
-            self.system.bridge.command(source, velocity, stamp, number, *self._times())
+            self.system.bridge.command(source, command, stamp, number, *self._times())
             self._stamps[source] = message.header.stamp
 
     def on_watchdog(self) -> None:

@@ -144,7 +144,7 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
             self._publish()
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        """Publish the velocity command of the procedure, if one runs."""
+        """Publish the motion that the procedure commands, if one runs."""
         pose, now = reading.needle_pose(message), self.get_clock().now().nanoseconds * 1e-9
         reading.check_pose_age(pose.stamp, now, self.configured_settings.pose_timeout)
         age = max(0.0, now - pose.stamp)
@@ -157,8 +157,8 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
         self._publish()
 
     def on_bridge(self, message: msg.CoilBridgeState) -> None:
-        """Pause where the coil bridge is disarmed or stopped; register the drift that it compensates."""
-        self._session.on_bridge(message.armed, message.drift)
+        """Pause where the coil bridge is disarmed or stopped; register the pull that it compensates."""
+        self._session.on_bridge(message.armed, (message.pull.x, message.pull.y))
         if self.is_active:
             self._publish()
 

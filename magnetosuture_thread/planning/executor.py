@@ -65,8 +65,8 @@ class ThreadCondition:
         friction_nodes: how many nodes are under friction.
         slowdown: factor on the needle's speed by the thread's friction, which the bridge applies.
         problem: why it is not known well enough to go on; empty if it is.
-        drift: velocity of the needle across its chord, to the left, by what pulls it, which the bridge measures and
-            compensates [m/s]; 0 if unknown.
+        pull: velocity that the thread's pull gives the needle, which the bridge measures and compensates, shape (2,)
+            [m/s]; 0 if unknown.
         may_hold: whether the needle may be kept in place by commands while there is a problem; else it is left alone.
         age: of the needle's pose when a command is sent [s]; 0 if unknown.
     """
@@ -76,7 +76,7 @@ class ThreadCondition:
     friction_nodes: int = 0
     slowdown: float = 1.0
     problem: str = ""
-    drift: float = 0.0
+    pull: Vector = field(default_factory=lambda: np.zeros(2))
     may_hold: bool = True
     age: float = 0.0
 
@@ -173,7 +173,7 @@ class ProcedureExecutor:
         self._goal_since = math.nan  # stamp at which the present goal was begun to be pursued [s]
         self._begin: Vector | None = None
         self._rest = RestDetector()
-        self._back_off, self._back_off_until = np.zeros(2), -math.inf
+        self._back_off, self._back_off_until = np.zeros(3), -math.inf
         self._speed = math.inf
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
@@ -250,7 +250,7 @@ class ProcedureExecutor:
             self.abort(str(error))
 
     def update(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
-        """Return the velocity commanded of the tip at a needle pose, shape (2,) [m/s].
+        """Return the motion commanded at a needle pose, see `NeedleTwist`, shape (3,) [m/s, m/s, rad/s].
 
         Args:
             stamp: of the pose [s].
@@ -262,7 +262,7 @@ class ProcedureExecutor:
         self._begin = middle if self._begin is None else self._begin
         self._heed(stamp, thread)
         self._thread = thread.vertices
-        self._compensates = self._compensates or thread.drift != 0.0
+        self._compensates = self._compensates or bool(thread.pull.any())
         if self.state in (ProcedureState.RUNNING, ProcedureState.PAUSED):
             self.judge.update(middle, thread.vertices)  # also by hand: a wrap may be unwound in a pause
         if self.state is not ProcedureState.RUNNING:
@@ -270,7 +270,7 @@ class ProcedureExecutor:
             if self.path is not None and self.resumes and thread.may_hold:
                 return self._hold(stamp, middle, angle, thread)
             self._holder = None
-            return np.zeros(2)
+            return np.zeros(3)
         velocity = None
         try:
             if not self._backs_off(stamp) and (self._tracker is not None or self._plan(middle, angle)):
@@ -297,7 +297,7 @@ class ProcedureExecutor:
     def _wait(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:
         """Return the command where there is no path to track: to back off, or to keep the needle in place."""
         if self.state is not ProcedureState.RUNNING:
-            return np.zeros(2)
+            return np.zeros(3)
         return self._back_off if self._backs_off(stamp) else self._hold(stamp, middle, angle, thread)
 
     def _backs_off(self, stamp: float) -> bool:
@@ -317,7 +317,7 @@ class ProcedureExecutor:
                 self._next_goal()
                 return None
             held = stamp, middle, angle, self.procedure.limits[self.goal].speed
-            return self._tracker.compute_command(*held, thread.slowdown, thread.drift, thread.age, hold=True).velocity
+            return self._tracker.compute_command(*held, thread.slowdown, thread.pull, thread.age, hold=True).twist
         # A thread may be wound or tight long before the end of the path, as its free end moves too.
         is_far = self.path.ends[self._reached] > self.travel + 2.0 * PROGRESS
         if isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last):
@@ -332,7 +332,7 @@ class ProcedureExecutor:
                 self._next_goal()
                 return None
             rest = self.path.part(self.travel, self.path.length)
-            self._replan(stamp, np.zeros(2), self.judge.missing(self.goal))
+            self._replan(stamp, np.zeros(3), self.judge.missing(self.goal))
             self._left = rest
             return None
         if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
@@ -354,7 +354,7 @@ class ProcedureExecutor:
         if (left := self.path.length - self._tracker.travel) < self.pursuit.left - PROGRESS:
             self.pursuit.detours, self.pursuit.left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
-        command = self._tracker.compute_command(*at, thread.slowdown, thread.drift, thread.age)
+        command = self._tracker.compute_command(*at, thread.slowdown, thread.pull, thread.age)
         if command.done:
             self._at_end(goal, middle)
             return None
@@ -364,15 +364,15 @@ class ProcedureExecutor:
         elif on_the_way and command.travel > self.path.ends[self._reached] + 0.5 * PROGRESS:
             self._miss(goal, middle)
             return None
-        commanded = bool(command.velocity.any())
+        commanded = bool(command.twist.any())
         rests = self._rest.update(stamp, middle, angle, self.planner.lever, commanded, command.travel)
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
             beside = self.planner.beside(middle, angle)
             pulled = "" if self._compensates else " with motion_compensation of the coil bridge off"
-            stopped, what = (command.velocity, "rests") if rests else (np.zeros(2), "is off its path")
+            stopped, what = (command.twist, "rests") if rests else (np.zeros(3), "is off its path")
             self._replan(stamp, stopped, f"the needle {what}{beside}{pulled}")
             return None
-        return command.velocity
+        return command.twist
 
     def _at_end(self, goal: Goal, middle: Vector) -> None:
         """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
@@ -472,8 +472,8 @@ class ProcedureExecutor:
         limits = self.procedure.limits[self.goal]
         if self._holder is None:
             self._holder = PathTracker(self.planner.standing_path(middle, angle, limits), self.planner.axes)
-        at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift, thread.age
-        return self._holder.compute_command(*at, hold=True).velocity
+        at = stamp, middle, angle, limits.speed, thread.slowdown, thread.pull, thread.age
+        return self._holder.compute_command(*at, hold=True).twist
 
     def _replan(self, stamp: float, stopped: Vector, why: str) -> None:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar, NamedTuple
@@ -123,7 +123,7 @@ class LoopState:
         self._pose, self._outside = -math.inf, ""
         self._tracker = ""
         self._margins: _Margins | None = None
-        self._tension = self._drift = 0.0
+        self._tension, self._pull = 0.0, np.zeros(2)
         self._vertices: Callable[[], Points | None] | None = None
         self._estimated, self._estimate_problem = -math.inf, ""
         self._disturbances: dict[float, str] = {}
@@ -175,9 +175,9 @@ class LoopState:
         """Go on in spite of the forces that are known now, as a person who begins or resumes wants; new ones count."""
         self._accepted = set(self._disturbances)
 
-    def on_bridge(self, drift: float) -> None:
-        """Register the velocity across the needle's chord that the bridge compensates [m/s]; 0 if it is no number."""
-        self._drift = drift if math.isfinite(drift) else 0.0
+    def on_bridge(self, pull: Sequence[float]) -> None:
+        """Register the velocity by the thread's pull that the bridge compensates [m/s]; 0 if it is not finite."""
+        self._pull = np.array(pull) if np.isfinite(pull).all() else np.zeros(2)
 
     def on_margins(self, now: float, reason: str, friction_nodes: int, slowdown: float, scene_version: str) -> None:
         """Register the thread's margins, or the reason why they are not valid."""
@@ -223,7 +223,7 @@ class LoopState:
             0 if margins is None else margins.friction_nodes,
             1.0 if margins is None or self._settings.friction_feedback != "all" else margins.slowdown,
             problem,
-            self._drift,
+            self._pull,
             may_hold,
         )
 
@@ -445,20 +445,20 @@ class ProcedureSession:
         self._executor.abort(reason)
         return True
 
-    def on_bridge(self, armed: bool, drift: float) -> None:
+    def on_bridge(self, armed: bool, pull: Sequence[float]) -> None:
         """Register whether the coil bridge is armed; a procedure pauses where it is not, until `resume`.
 
         Args:
             armed: whether it is.
-            drift: velocity across the needle's chord that it compensates [m/s].
+            pull: velocity that the thread's pull gives the needle, which it compensates, two numbers [m/s].
         """
-        self.known.on_bridge(drift)
+        self.known.on_bridge(pull)
         self._armed = armed
         if not armed and (self.is_running or (self._executor is not None and self._executor.resumes)):
             self.pause("the coil bridge is not armed")
 
     def on_pose(self, stamp: float, tail: Vector, heading: Vector, now: float, age: float = 0.0) -> Vector | None:
-        """Return the velocity commanded of the tip at a needle pose, shape (2,) [m/s]; None where nothing is commanded.
+        """Return the motion commanded at a needle pose, see `NeedleTwist`, shape (3,); None where nothing is commanded.
 
         A procedure that is paused by itself, for the thread, keeps the needle in place.
 

@@ -141,8 +141,8 @@ class ClosedLoop:
         self._tracker = TrackerSession(setup.vision, setup.scene) if camera else None
         self.now = self._next_frame = START
         self._waiting: list[Measurement] = []
-        self._count, self._reason, self._drift = 0, "", 0.0
-        self._condition, self._commanded = ThreadCondition(problem="no thread yet"), np.zeros(2)
+        self._count, self._reason, self._pull = 0, "", np.zeros(2)
+        self._condition, self._commanded = ThreadCondition(problem="no thread yet"), np.zeros(3)
 
     def step(self) -> LoopFrame | None:
         """Go on by a period of the bridge; return the frame if one was taken.
@@ -159,7 +159,7 @@ class ClosedLoop:
         while self._waiting and self._waiting[0].due <= self.now + 1e-9:
             self._take(self._waiting.pop(0))
         output = self.bridge.step(self.now, self.now, self._driver)
-        self._reason, self._drift = output.reason, output.drift
+        self._reason, self._pull = output.reason, output.pull
         if self._recorder is not None:
             self._recorder.on_bridge(self.now, output)
         self.rig.apply(self._gains * output.allocation.currents, self.now - START)
@@ -216,7 +216,7 @@ class ClosedLoop:
         margins = result.margins
         slowdown = margins.friction.slowdown if margins else 1.0
         self.bridge.on_margins(stamp, margins is not None, slowdown, result.scene_version, now)
-        condition = replace(condition_of(result), drift=self._drift, age=now - stamp)
+        condition = replace(condition_of(result), pull=self._pull, age=now - stamp)
         slows = self.setup.coils.friction_feedback == "all"
         self._condition = condition if slows else replace(condition, slowdown=1.0)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)

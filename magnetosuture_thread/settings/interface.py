@@ -29,6 +29,7 @@ FRAME_PREFIX_VARIABLE = "MAGNETOSUTURE_FRAME_PREFIX"
 FRAME_PREFIX = os.environ.get(FRAME_PREFIX_VARIABLE, "").lstrip("/")  # tf2 takes no frame that begins with one
 DISH_FRAME = f"{FRAME_PREFIX}dish"
 CAMERA_FRAME = f"{FRAME_PREFIX}camera"
+NEEDLE_FRAME = f"{FRAME_PREFIX}needle"  # its origin is the middle of the chord, x to the tip, y to the left; not in tf
 STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folder a bag
 
 
@@ -84,7 +85,7 @@ TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped")
 OPERATOR_COMMAND = Channel("operator/servo_cv", "geometry_msgs/msg/TwistStamped")
 #: commanded, filtered and applied velocity, active constraints, why the needle rests
 FILTER_STATE = Channel("needle/filter_state", "magnetosuture_msgs/msg/FilterState")
-#: velocity of the tip, followed while no operator commands; of one node at a time
+#: motion in the frame `needle`, or velocity of the tip in `dish`, while no operator commands; of one node at a time
 NEEDLE_COMMAND = Channel("needle/servo_cv", "geometry_msgs/msg/TwistStamped")
 #: velocity that the currents give
 NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped")

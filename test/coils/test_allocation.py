@@ -16,7 +16,7 @@ from magnetosuture_thread.coils.allocation import (
     NeedleMechanics,
 )
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
-from magnetosuture_thread.coils.motion_observer import MotionDisturbance
+from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig.setups import read_setup
 
@@ -37,14 +37,16 @@ def turned(vector: np.ndarray, angle: float) -> np.ndarray:
     return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
-def test_no_velocity_takes_no_current():
-    found = allocation().allocate(np.zeros(2), MIDDLE, EAST)
-    assert found.currents.tolist() == [0.0] * 4
-    assert found.velocity.tolist() == [0.0, 0.0]
+def test_for_no_motion_the_field_holds_the_direction():
+    found = allocation().allocate(NeedleTwist(), MIDDLE, EAST)
+    field = COILS.per_current(np.zeros(2)) @ found.currents
+    assert field[0] > 0.4 * 0.008
+    assert abs(field[1]) < 1e-3 * field[0]
+    assert np.linalg.norm(found.velocity) < 1e-5
 
 
 def test_the_coil_ahead_pulls_and_the_field_lies_along_the_needle():
-    found = allocation().allocate(0.005 * EAST, MIDDLE, EAST)
+    found = allocation().allocate(NeedleTwist(0.005), MIDDLE, EAST)
     assert found.currents[0] == max(found.currents)
     field = COILS.per_current(np.zeros(2)) @ found.currents
     assert field[0] == pytest.approx(0.008, rel=0.5)
@@ -67,7 +69,8 @@ def test_away_from_the_wall_the_velocity_is_reached_by_the_physics(
     tail, heading = np.array([x, y]), turned(EAST, angle)
     assume(np.linalg.norm([tail, tail + NEEDLE.length * heading], axis=1).max() < 0.012)
     velocity = speed * turned(heading, way)
-    found = allocation(limit=1000.0).allocate(velocity, tail, heading)
+    twist = NEEDLE.kinematics.twist(heading, velocity)
+    found = allocation(limit=1000.0).allocate(twist, tail, heading, at_tip=True)
     across = turned(heading, np.pi / 2)
     pole = NEEDLE.moment / NEEDLE.length
     at_tail = COILS.per_current(tail) @ found.currents
@@ -78,19 +81,26 @@ def test_away_from_the_wall_the_velocity_is_reached_by_the_physics(
         (force @ across) / NEEDLE.drag_across + 0.5 * NEEDLE.length * torque / NEEDLE.turning_drag
     ) * across
     np.testing.assert_allclose(found.velocity, tip, atol=1e-9)
+    assert found.drift == pytest.approx((force @ across) / NEEDLE.drag_across, abs=1e-9)
     assert np.linalg.norm(tip - velocity) < 0.15 * speed
 
 
 def test_saturation_is_reported_with_the_velocity_really_reached():
-    found = allocation(limit=0.5).allocate(0.02 * EAST, MIDDLE, EAST)
+    found = allocation(limit=0.5).allocate(NeedleTwist(0.02), MIDDLE, EAST)
     assert found.saturated
     assert np.abs(found.currents).max() == pytest.approx(0.5)
     assert 0.0 < found.velocity[0] < 0.01
 
 
-@given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), x=st.floats(-0.017, 0.017), angle=st.floats(-np.pi, np.pi))
-def test_currents_never_leave_their_limits(vx: float, vy: float, x: float, angle: float):
-    found = allocation(limit=3.0).allocate(np.array([vx, vy]), np.array([x, 0.5 * x]), turned(EAST, angle))
+@given(
+    vx=st.floats(-1.0, 1.0),
+    vy=st.floats(-1.0, 1.0),
+    turn=st.floats(-1e3, 1e3),
+    x=st.floats(-0.017, 0.017),
+    angle=st.floats(-np.pi, np.pi),
+)
+def test_currents_never_leave_their_limits(vx: float, vy: float, turn: float, x: float, angle: float):
+    found = allocation(limit=3.0).allocate(NeedleTwist(vx, vy, turn), np.array([x, 0.5 * x]), turned(EAST, angle))
     assert np.all(np.isfinite(found.currents))
     assert (np.abs(found.currents) <= 3.0).all()
 
@@ -103,13 +113,13 @@ def test_close_to_the_axis_of_a_coil_a_pull_across_the_needle_is_compensated_and
     e = turned(EAST, np.radians(degrees))
     n = np.array([-e[1], e[0]])
     tail = np.array([0.00226, 0.01153]) - 0.5 * needle.chord * e
-    pulled = MotionDisturbance(along=-0.0007, drift=0.0015)
-    wanted = 0.001 * e - 0.0014 * n
-    found = made.allocate(wanted - pulled.velocity(e), tail, e, disturbance=pulled)
-    moved = found.velocity + pulled.velocity(e)
-    assert found.drift == pytest.approx(-pulled.drift, abs=5e-4)
-    assert moved @ e == pytest.approx(wanted @ e, abs=1e-4)
-    assert moved @ n == pytest.approx(wanted @ n, abs=5e-4)
+    pulled = NeedleTwist(-0.0024, 0.0015)  # with what a straight thread adds to the drag
+    wanted = needle.kinematics.twist(e, 0.001 * e - 0.0014 * n)
+    found = made.allocate(wanted.less(pulled), tail, e)
+    moved = found.velocity + needle.kinematics.tip_velocity(e, pulled)
+    assert found.drift == pytest.approx(-pulled.across, abs=6.5e-4)
+    assert moved @ e == pytest.approx(0.001, abs=1e-4)
+    assert moved @ n - found.drift - pulled.across == pytest.approx(-0.0014, abs=5e-5)
     assert np.abs(found.currents).max() < settings.max_current
 
 
@@ -121,8 +131,8 @@ def test_however_it_is_pulled_the_field_stays_along_the_needle_and_turns_it_as_c
     e = turned(EAST, np.radians(degrees))
     n = np.array([-e[1], e[0]])
     tail = np.array([-0.0066, 0.0043]) - 0.5 * needle.chord * e
-    pulled = MotionDisturbance(along=0.0002, drift=drift)
-    found = made.allocate(0.001 * e - 0.001 * n - pulled.velocity(e), tail, e, disturbance=pulled)
+    wanted = needle.kinematics.twist(e, 0.001 * e - 0.001 * n)
+    found = made.allocate(wanted.less(NeedleTwist(0.0002, drift)), tail, e)
     fields = [coils.per_current(at) @ found.currents for at in (tail, tail + needle.chord * e)]
     assert 0.5 * (fields[0] + fields[1]) @ e > 0.35 * settings.aligning_field
     assert found.velocity @ n - found.drift == pytest.approx(-0.001, abs=1e-4)
@@ -131,14 +141,14 @@ def test_however_it_is_pulled_the_field_stays_along_the_needle_and_turns_it_as_c
 @pytest.mark.parametrize("turn", [0.0, 0.4, np.pi / 4])
 def test_along_the_axes_of_coils_no_currents_hold_the_needle_and_beside_them_they_do(turn: float):
     coils = LoopCoils(coils_around([turn + k * np.pi / 2 for k in range(4)], 0.05, 0.025, 1.2e-3))
-    made, pull = CoilAllocation(coils, NEEDLE, 0.008, 10.0), MotionDisturbance(0.0, 1e-3)
+    made = CoilAllocation(coils, NEEDLE, 0.008, 10.0)
     axes = [axis for axis, _ in made.axes()]
     assert axes == pytest.approx([turn, turn + 0.5 * np.pi], abs=1e-3)
     for axis in axes:
         drifts = []
         for angle in (axis - 0.3, axis, axis + 0.3):
             e = turned(EAST, angle)
-            drifts.append(made.allocate(-pull.velocity(e), -0.5 * NEEDLE.chord * e, e, disturbance=pull).drift)
+            drifts.append(made.allocate(NeedleTwist(0.0, -1e-3), -0.5 * NEEDLE.chord * e, e).drift)
         assert drifts == pytest.approx([-1e-3, 0.0, -1e-3], abs=2e-4)
 
 
@@ -148,9 +158,8 @@ def test_what_is_held_for_each_radian_off_an_axis_turns_the_field_by_no_more_tha
     made, off = settings.allocation(), 0.1
     axis, held = made.axes()[0]
     e = turned(EAST, axis + off)
-    tail, pull = -0.5 * settings.needle().chord * e, MotionDisturbance(0.0, off * held)
-    at_rest = made.allocate(1e-6 * e, tail, e, disturbance=MotionDisturbance())
-    against = made.allocate(-pull.velocity(e), tail, e, disturbance=pull)
+    tail = -0.5 * settings.needle().chord * e
+    at_rest, against = (made.allocate(NeedleTwist(0.0, across), tail, e) for across in (0.0, -off * held))
     assert against.drift == pytest.approx(-off * held, rel=0.1)
     field = COIL_ERROR * settings.field_per_current * np.linalg.norm(against.currents - at_rest.currents)
     assert field / settings.aligning_field == pytest.approx(DIRECTION_DEVIATION, rel=0.2)

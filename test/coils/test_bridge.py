@@ -232,10 +232,11 @@ def driven(
     heading, needle, plant.tail = EAST, plant.settings.needle().kinematics, None
     poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
     for number in range(1, steps):
-        poses.append((plant.time, tail, heading))
+        now = plant.time + PERIOD  # of the step, from which on its currents move the needle
+        poses.append((now, tail, heading))
         if number > latency and number % interval == 0:
             then, old_tail, old_heading = poses[number - 1 - latency]
-            plant.bridge.on_pose(old_tail - error, old_heading, then, number, plant.time, plant.time)
+            plant.bridge.on_pose(old_tail - error, old_heading, then, number, now, now)
         found = plant.run(PERIOD)[0].allocation
         e = needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])

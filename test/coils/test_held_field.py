@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.motion_observer import MotionDisturbance
+from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.rig.setups import read_setup
 
@@ -26,10 +26,8 @@ def test_a_needle_that_is_turned_stops_turning_within_the_turn_time_though_the_c
     angle, previous = dynamics.heading, allocation.zero().currents
     for _ in range(round(0.06 / period)):
         direction = np.array([math.cos(angle), math.sin(angle)])
-        e = needle.chord_direction(direction)
-        tip = 0.5 * needle.chord * rate * np.array([-e[1], e[0]])
         change = coils.max_current_slew * period
-        found = allocation.allocate(tip, dynamics.tail, direction, previous, change, disturbance=MotionDisturbance())
+        found = allocation.allocate(NeedleTwist(turn_rate=rate), dynamics.tail, direction, previous, change)
         previous = found.currents
         dynamics.step(previous, period)
         angle += rate * period  # as the bridge believes

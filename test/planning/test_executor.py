@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.needle_motion import NeedleKinematics
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.planning.executor import (
@@ -47,7 +47,6 @@ class Needle:
         self.tail, self.heading = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
         self.share, self.drift, self.time, self.way = 1.0, np.zeros(2), 1.0, 0.0
         self.pull = np.zeros(2)  # whatever is commanded
-        self.thrown = np.zeros(2)  # for each radian that it turns, as by its thread in a crossing of an axis [m]
         self.trail = [self.tail - 0.03 * self.heading]  # where its tail has been: its thread, the free end first
 
     def run(
@@ -62,13 +61,13 @@ class Needle:
         while self.time < end and run.state not in (ProcedureState.DONE, ProcedureState.FAILED) and not until():
             self.trail.append(self.tail)
             known = replace(KNOWN, vertices=self.thread) if condition is None else condition()
-            velocity = run.update(self.time, self.tail, self.heading, known)
-            self.way += math.hypot(*velocity) / RATE
-            moved = NEEDLE.body_velocity(self.heading, self.share * velocity)
-            before = self.heading
-            self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *moved, 1.0 / RATE)
-            self.tail = self.tail + math.acos(min(1.0, float(before @ self.heading))) * self.thrown
-            self.tail = self.tail + (self.drift * bool(velocity.any()) + self.pull) / RATE
+            command = run.update(self.time, self.tail, self.heading, known)
+            twist = NeedleTwist(*(self.share * command))
+            tip = NEEDLE.tip_velocity(self.heading, twist)
+            self.way += math.hypot(*NEEDLE.tip_velocity(self.heading, NeedleTwist(*command))) / RATE
+            moved = NEEDLE.body_velocity(self.heading, tip)
+            self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *moved, 1.0 / RATE, twist.across)
+            self.tail = self.tail + (self.drift * bool(command.any()) + self.pull) / RATE
             self.time += 1.0 / RATE
 
     @property
@@ -277,7 +276,7 @@ def test_a_place_that_is_missed_however_it_is_planned_is_given_up_with_the_dista
     run, needle = executor({"go_to": {**GOAL_WITH_A_TURN, "tolerance": 5e-5}}), Needle()
     run.start()
     for _ in range(round(120.0 * RATE)):
-        needle.thrown = np.array([4e-4 if run.pursuit.misses % 2 else -4e-4, 0.0])
+        needle.pull = np.array([6e-4 if run.pursuit.misses % 2 else -6e-4, 0.0])  # that nobody compensates
         needle.run(run, 1.0 / RATE)
     assert run.state is ProcedureState.FAILED
     assert "the needle misses its place by" in run.reason
