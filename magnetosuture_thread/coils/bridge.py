@@ -310,6 +310,7 @@ class CoilBridge:
         slowdown = self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0
         kinematics, pull = self._needle.kinematics, self._observer.pull(pose.heading) if compensates else None
         if len(selected.command) == 3:
+            self._filter.set_time(now, self.extrapolator.first_stamp)
             commanded = NeedleTwist(*selected.command.tolist())
             tip = kinematics.tip_velocity(pose.heading, commanded)
             selected = selected._replace(tip=tip)

@@ -281,6 +281,19 @@ class NeedleSafetyFilter:
         self._pose = None
         is_clear_turned(1e-3, 0.0, self._at(np.zeros(2), EAST), 0.0)  # compiled now, not in the first step
 
+    def set_time(self, time: float | None, first_time: float = 0.0) -> None:
+        """Set the time of the next calls, for barriers that move; see `Barrier.set_time` [s].
+
+        Args:
+            time: now, by the clock of the poses' stamps; None if there is none [s].
+            first_time: of the needle's first pose by that clock [s].
+
+        Raises:
+            InvalidInputError: a barrier moves and there is no time.
+        """
+        self._added.time, self._added.first_time = time, first_time
+        self._added.set_time()
+
     def compiled_data(self) -> FilterData:
         """Return the filter for compiled loops.
 
@@ -323,8 +336,7 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite or out of bounds, or a barrier moves and there is no time.
         """
-        self._added.time, self._added.first_time = time, first_time
-        self._added.set_time()
+        self.set_time(time, first_time)
         commanded = _checked_velocity(commanded)
         if not commanded.any():
             return FilteredCommand(commanded, np.zeros(2), slowdown)

@@ -383,7 +383,7 @@ class _Pilot:
         self._now = 0.0
 
     def __call__(self, stamp: float, tail: Vector, heading: Vector, thread: executor.ThreadCondition) -> Vector:
-        """Return the velocity of the tip, and begin as soon as the thread is known."""
+        """Return the motion of the needle, and begin as soon as the thread is known."""
         self._now = stamp
         if self.executor.state is executor.ProcedureState.READY and not thread.problem:
             self.executor.start()

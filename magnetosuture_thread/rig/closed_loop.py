@@ -42,7 +42,7 @@ RECORDED = (  # what the bag of a run holds, besides frames
 )
 
 Controller = Callable[[float, Vector, Vector, ThreadCondition], Vector]
-"""From stamp [s], tail [m], heading and the thread's condition to the velocity commanded of the tip [m/s]."""
+"""From stamp [s], tail [m], heading and the thread's condition to the command, see `CoilBridge.command`."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class LoopFrame:
         thread: in truth, shape (n + 1, 2) [m].
         tension: peak of the thread in truth [N].
         condition: what the model knows of the thread.
-        commanded: velocity of the tip that the controller wants, shape (2,) [m/s].
+        commanded: by the controller, see `CoilBridge.command`.
         reason: why the coils are at zero; empty if they are not.
     """
 
@@ -98,7 +98,7 @@ class LoopRecorder(Protocol):
         """Take a frame with its ground truth."""
 
     def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
-        """Take a measurement, what the thread model makes of it, and the commanded velocity of the tip [m/s]."""
+        """Take a measurement, what the thread model makes of it, and the command, see `CoilBridge.command`."""
 
     def on_bridge(self, now: float, output: BridgeOutput) -> None:
         """Take a step of the coil bridge."""

@@ -22,8 +22,11 @@ SCENE = Scene.create(dish_diameter=0.035)
 DURATION = 2.0  # s
 
 
+@pytest.mark.parametrize("in_frame_of_needle", [False, True])
 @pytest.mark.parametrize("start", [1.0, 1.7e9])  # s; a simulated clock, and that on the wall
-def test_the_example_holds_in_a_closed_loop_at_any_time_of_the_day(start: float, monkeypatch: pytest.MonkeyPatch):
+def test_the_example_holds_in_a_closed_loop_at_any_time_of_the_day(
+    start: float, in_frame_of_needle: bool, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.syspath_prepend(str(FOLDER / "barriers"))
     setup, driver, latch, disc = read_setup("petri_35mm_polyamide_post"), DriverState(True), ArmingLatch(), MovingDisc()
     settings = replace(setup.coils, barriers=NAMES, motion_compensation=False)
@@ -45,6 +48,7 @@ def test_the_example_holds_in_a_closed_loop_at_any_time_of_the_day(start: float,
             expected = disc.value(result.prediction.positions)
             np.testing.assert_allclose(result.prediction.margins["moving_disc"].value, expected, atol=2e-9)
         command = np.array([0.0, -0.003 if fleeing else 0.001])  # towards the disc until that counts, then off
+        command = np.array(needle.twist(heading, command)) if in_frame_of_needle else command
         bridge.command(NEEDLE, command, now, step + 1, now, now)
         bridge.on_margins(now, True, 1.0, SCENE.version, now)
         output = bridge.step(now, now, driver)
