@@ -222,7 +222,7 @@ class CoilBridge:
             if self.latch.armed and self.extrapolator.rejections >= CONSISTENT_POSES:
                 self.latch.trip(f"needle does not follow: {self.extrapolator.rejection}")
             raise
-        motion = self._observer.update(tail, heading, stamp)
+        motion = self._observer.update(tail, heading, stamp, self._follow.is_trusted(stamp))
         if motion is not None and self.latch.armed and self._filter is not None:
             at_shape = self._filter.clearance(tail, heading) < self._filter.keep_out
             if problem := self._follow.update(motion, at_shape):

@@ -15,6 +15,8 @@ Vector = NDArray[np.float64]
 
 PLACE_DEVIATION = 1.2e-5  # m; of a tracked middle
 PULL_NOISE = 1e-4  # m^2/s^3; a pull changes by 10 mm/s, root mean square, in 1 s
+VISIBLE = 6e-5  # m; four times the noise of a displacement between two poses
+MAX_STILL = 0.3  # s; after which poses that have not visibly moved are the place that the next ones are compared with
 MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
 MIN_WINDOW = 0.15  # s; two time constants of the motion observer, in which it compensates a pull that has changed
 MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
@@ -26,6 +28,7 @@ MAX_TURN = 1.0  # rad; the field's torque keeps a needle nearer to its direction
 PROBE_TURN, PROBE_RATE = 0.2, 4.0  # rad, forty times the noise of a heading, and rad/s
 PROBE_SHARE = 0.2  # of a turn of the field, which the needle makes at least
 PROBE_TIMEOUT = 0.4  # s; a needle that could not be turned by then does not follow
+TRUST_TIME = 1.0  # s after a probe that the needle has followed
 MAX_ERROR, MAX_ERROR_SHARE = 2.0, 0.8  # of d and of the expected displacement, while a pull is learnt that has changed
 
 
@@ -40,6 +43,10 @@ class MotionObserver:
     d is at most `max_speed`. The coils compensate d: for the motion u they are set to c = u - d. Where the needle moves
     at k c, d converges with poses up to 0.4 s late for k from 0.5 to 1.5, so the drag of the model is the needle's own:
     that of the thread is a part of the pull.
+
+    It learns only from motion that can be seen: a pose counts once the middle has moved by `VISIBLE` since the last one
+    that did, or while no currents are on, or while the needle is trusted to be tracked. Poses that stand still thus
+    wind up nothing.
 
     Source: the Kalman filter of a constant disturbance. Deviation: d is bounded. Pure: times come in, in seconds.
 
@@ -60,6 +67,7 @@ class MotionObserver:
         self._needle, self._min_hold, self._max_speed, self._max_interval = needle, min_hold, max_speed, max_interval
         self._place, self._velocity, self._covariance = np.zeros(2), np.zeros(2), np.zeros((2, 2))
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
+        self._seen: tuple[float, Vector] | None = None  # the last pose that counted
         self._applied: deque[tuple[float, Vector]] = deque()  # what the currents were set for, each with its start
 
     @property
@@ -72,33 +80,24 @@ class MotionObserver:
         (ex, ey), (x, y) = self._needle.chord_direction(heading), self._velocity
         return NeedleTwist(float(ex * x + ey * y), float(ex * y - ey * x), 0.0)
 
-    def update(self, tail: Vector, heading: Vector, stamp: float) -> MotionStep | None:
+    def update(self, tail: Vector, heading: Vector, stamp: float, trusted: bool = False) -> MotionStep | None:
         """Update with a measured pose; return the motion since the last one, None where it cannot be compared.
 
         Args:
             tail: shape (2,) [m].
             heading: unit vector at the tail, shape (2,).
             stamp: when it was measured [s].
+            trusted: whether to learn also from a needle that stands still.
         """
         e = self._needle.chord_direction(heading)
         middle = tail + 0.5 * self._needle.chord * e
         last, self._last = self._last, (stamp, middle, e)
-        interval = math.inf if last is None else stamp - last[0]
-        known = 0.0 < interval <= MAX_GAP
-        applied = self._mean_applied(stamp - interval, stamp) if known else None
+        if last is None or not 0.0 < stamp - last[0] <= MAX_GAP:
+            self._velocity, self._seen = np.zeros(2), None
+        self._learn(stamp, middle, trusted)
+        interval = 0.0 if last is None else stamp - last[0]
+        applied = self._mean_applied(stamp - interval, stamp) if 0.0 < interval <= self._max_interval else None
         if last is None or applied is None:
-            self._place, self._covariance = middle, np.diag([PLACE_DEVIATION**2, PULL_NOISE * MAX_GAP])
-            if not known:
-                self._velocity = np.zeros(2)
-            return None
-        self._predict(interval, applied[:2])
-        innovation = middle - self._place
-        gain = self._covariance[0] / (self._covariance[0, 0] + PLACE_DEVIATION**2)
-        self._covariance = self._covariance - np.outer(gain, self._covariance[0])
-        self._place = self._place + gain[0] * innovation
-        learnt = self._velocity + gain[1] * innovation
-        self._velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
-        if interval > self._max_interval:
             return None
         before = last[2]
         turn = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
@@ -107,7 +106,26 @@ class MotionObserver:
             stamp, interval, interval * applied[2:4], interval * applied[4], middle - last[1], turn, swing
         )
 
+    def _learn(self, stamp: float, middle: Vector, trusted: bool) -> None:
+        """Update the filter with a measured middle, shape (2,) [m], if that counts."""
+        seen = self._seen
+        interval = math.inf if seen is None else stamp - seen[0]
+        applied = self._mean_applied(stamp - interval, stamp) if interval <= MAX_STILL else None
+        if seen is None or applied is None:
+            self._seen = stamp, middle
+            self._place, self._covariance = middle, np.diag([PLACE_DEVIATION**2, PULL_NOISE * MAX_GAP])
+        elif trusted or not applied[:2].any() or math.hypot(*(middle - seen[1])) > VISIBLE:
+            self._seen = stamp, middle
+            self._predict(interval, applied[:2])
+            innovation = middle - self._place
+            gain = self._covariance[0] / (self._covariance[0, 0] + PLACE_DEVIATION**2)
+            self._covariance = self._covariance - np.outer(gain, self._covariance[0])
+            self._place = self._place + gain[0] * innovation
+            learnt = self._velocity + gain[1] * innovation
+            self._velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
+
     def _predict(self, interval: float, applied: Vector) -> None:
+        """Predict place and covariance after an interval [s] with a velocity by the currents, shape (2,) [m/s]."""
         self._place = self._place + interval * (applied + self._velocity)
         step = np.array([[1.0, interval], [0.0, 1.0]])
         noise = PULL_NOISE * np.array([[interval**3 / 3.0, interval**2 / 2.0], [interval**2 / 2.0, interval]])
@@ -131,7 +149,7 @@ class MotionObserver:
     def _register(self, now: float, velocity: Vector) -> None:
         if self._applied and now < self._applied[-1][0]:
             self._applied.clear()  # time was set back
-            self._last = None
+            self._last = self._seen = None
         self._applied.append((now, velocity))
         while len(self._applied) > 1 and self._applied[1][0] < now - MAX_GAP:
             self._applied.popleft()
@@ -207,6 +225,7 @@ class FollowMonitor:
         self._probed: float | None = None  # stamp of the pose that began the probe
         self._turned = 0.0  # by which the field was turned since
         self._direction = 1.0
+        self._trusted_until = -math.inf
         self._suspicion = ""
 
     def clear(self) -> None:
@@ -227,6 +246,10 @@ class FollowMonitor:
     def register_turn(self, angle: float) -> None:
         """Register by which angle the field was set to turn the needle [rad]."""
         self._turned += angle
+
+    def is_trusted(self, stamp: float) -> bool:
+        """Return whether a probe has lately shown that the poses are the needle's."""
+        return stamp <= self._trusted_until
 
     def update(self, step: MotionStep, at_shape: bool = False) -> str:
         """Take the motion between two poses; return why the needle does not follow, or an empty text.
@@ -302,6 +325,7 @@ class FollowMonitor:
         if measured * math.copysign(1.0, expected) < PROBE_SHARE * abs(expected):
             return self._suspicion
         self.clear()
+        self._trusted_until = stamp + TRUST_TIME
         return ""
 
 

@@ -38,6 +38,7 @@ def test_poses_that_stand_still_and_do_not_turn_are_not_the_needles():
 def test_a_needle_that_a_thread_holds_turns_with_the_field_and_is_no_fault():
     monitor = FollowMonitor(5e-4)
     assert watch(monitor, np.zeros(2), follows_turns=True) == ""
+    assert monitor.is_trusted(3.0)
 
 
 @pytest.mark.parametrize("moved", [-EAST, np.array([0.0, SPEED * INTERVAL]), 15.0 * EAST])

@@ -99,7 +99,7 @@ def test_what_is_compensated_converges_with_late_poses(mobility: float, late: in
         if k % 10 == 0:
             waiting.append((tail, now))
             if len(waiting) > late:
-                observer.update(waiting[-1 - late][0], e, waiting[-1 - late][1])
+                observer.update(waiting[-1 - late][0], e, waiting[-1 - late][1], trusted=True)
         applied = wanted - observer.pull(e).along
         apply(observer, now, e, applied, 0.0)
         before, tail = tail, tail + PERIOD * (mobility * applied + pull) * e
@@ -112,7 +112,7 @@ def test_currents_that_the_coils_may_have_switched_off_say_nothing(held: float, 
     observer, e = MotionObserver(NEEDLE.kinematics, min_hold=0.0625), direction(0.3)
     observer.update(np.zeros(2), e, 1.0)
     apply(observer, 1.0, e, 4e-3, 0.0)
-    observer.update(np.zeros(2), e, 1.0 + held)
+    observer.update(np.zeros(2), e, 1.0 + held, trusted=True)
     assert (observer.pull(e).along < 0.0) == learned
 
 
@@ -121,3 +121,16 @@ def test_motion_is_judged_at_every_interval_at_which_a_pose_is_valid(interval: f
     observer, e = MotionObserver(NEEDLE.kinematics, max_interval=0.3), direction(0.3)
     observer.update(np.zeros(2), e, 1.0)
     assert (observer.update(np.zeros(2), e, 1.0 + interval) is not None) == judged
+
+
+def test_nothing_is_learnt_of_poses_that_stand_still():
+    """Another object is tracked: currents do not move it, and only a needle known to be tracked is taken for held."""
+    observer, e, random = MotionObserver(NEEDLE.kinematics), direction(0.3), np.random.default_rng(0)
+    for k in range(100):
+        apply(observer, 1.0 + 0.05 * k, e, 2e-3, 0.0)
+        observer.update(1e-5 * random.standard_normal(2), e, 1.0 + 0.05 * k)
+    assert observer.pull(e) == (0.0, 0.0, 0.0)
+    for k in range(100, 140):
+        apply(observer, 1.0 + 0.05 * k, e, 2e-3, 0.0)
+        observer.update(np.zeros(2), e, 1.0 + 0.05 * k, trusted=True)
+    assert observer.pull(e).along == pytest.approx(-2e-3, rel=0.01)

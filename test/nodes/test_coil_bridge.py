@@ -12,6 +12,7 @@ from geometry_msgs.msg import TwistStamped
 from magnetosuture_msgs.msg import CoilBridgeState
 from rosgraph_msgs.msg import Clock
 
+from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.geometry.scene_files import read_scene
@@ -38,7 +39,7 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     states = graph.listen(topics.BRIDGE_STATE)
     asked = drive(graph)
     graph.wait(lambda: any(m.command == asked.header.stamp for m in currents), "currents for the command")
-    expected = CoilBridgeSettings().allocation().allocate(np.array([0.005, 0.0]), TAIL, EAST).currents
+    expected = CoilBridgeSettings().allocation().allocate(NeedleTwist(0.005), TAIL, EAST, at_tip=True).currents
     assert expected[0] > 2.0
     drive_until(
         graph, lambda: any(np.allclose(told, expected, atol=0.05) for told in applied(node)), "the full currents"

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
 from magnetosuture_thread.planning.procedure import Tighten, parse_procedure, read_procedure
 from magnetosuture_thread.rig.closed_loop import LATENCY
@@ -23,7 +24,7 @@ PERIOD = 0.05
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
+def test_an_ideal_needle_gets_to_the_end_by_certified_motions(name: str):
     procedure = read_procedure(name)
     setup = read_procedure_setup(procedure)
     setup.rig.check_scene(setup.scene)
@@ -47,11 +48,11 @@ def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
                 centre = np.array(at[0]) if at else np.zeros(2)
                 drawn = centre + 0.1 * (thread - centre)  # which winds as before
                 condition = replace(condition, tension=goal.tension, vertices=drawn)
-        velocity = executor.update(time, tail, heading, condition)
-        if velocity.any():
-            velocity = safety.filter(velocity, tail, heading).filtered
-        moved = safety.kinematics.body_velocity(heading, velocity)
-        tail, heading = safety.kinematics.moved(tail, heading, *moved, PERIOD)
+        twist = NeedleTwist(*executor.update(time, tail, heading, condition))
+        tip = safety.kinematics.tip_velocity(heading, twist)
+        share, _ = safety.safe_share(tip, tail, heading, twist.across)
+        moved = safety.kinematics.body_velocity(heading, share * tip)
+        tail, heading = safety.kinematics.moved(tail, heading, *moved, PERIOD, share * twist.across)
         clearance, time = min(clearance, safety.clearance(tail, heading)), time + PERIOD
     assert (executor.state, executor.reason) == (ProcedureState.DONE, "")
     assert clearance >= keep_out - 1e-9
