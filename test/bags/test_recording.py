@@ -169,6 +169,19 @@ def test_a_scene_of_a_rig_with_a_prefix_is_read_in_our_frame(tmp_path: Path):
     assert only(Recording(Bag(tmp_path / "bag")), SCENE).header.frame_id == "left/dish"
 
 
+@pytest.mark.parametrize("prefix", ["", "left/"])
+def test_a_motion_in_the_needle_s_own_frame_is_not_transformed(tmp_path: Path, prefix: str):
+    """The needle's frame is not in tf: a command is of wherever the needle is."""
+    along, turn = (make("geometry_msgs/msg/Vector3", *at) for at in ((1e-3, 2e-3, 0.0), (0.0, 0.0, 0.5)))
+    twist = make(
+        "geometry_msgs/msg/TwistStamped", stamped(1, f"{prefix}needle"), make("geometry_msgs/msg/Twist", along, turn)
+    )
+    recording = Recording(bag_of(tmp_path, (NEEDLE_COMMAND.recorded, twist)), dish_frame=f"{prefix}dish")
+    command = only(recording, NEEDLE_COMMAND)
+    assert command.header.frame_id == "needle"
+    assert (command.twist.linear.y, command.twist.angular.z) == (2e-3, 0.5)
+
+
 def test_poses_of_another_frame_are_transformed(tmp_path: Path):
     """Frames: world <- dish turned by 90 degrees at x = 10; world <- arm moves; arm <- tool is fixed."""
     bag = bag_of(

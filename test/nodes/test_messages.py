@@ -115,6 +115,7 @@ PACKED = {
     "setpoint": (interface.TIP_SETPOINT, packing.packed_pose_stamped(7, TAIL, 0.3)),
     "point": (interface.NEEDLE_TIP, packing.packed_point(7, TAIL)),
     "twist": (interface.NEEDLE_COMMAND, packing.packed_twist(7, TAIL)),
+    "twist of the needle": (interface.NEEDLE_COMMAND, packing.packed_twist(7, np.array([1e-3, -2e-3, 0.5]))),
     "wrench": (interface.GROUND_TRUTH_PULL, packing.packed_wrench(7, TAIL, 1e-9)),
     "path": (interface.MEASURED_THREAD, packing.packed_path(7, POINTS)),
     "empty path": (interface.MEASURED_THREAD, packing.packed_path(7, POINTS[:0])),
@@ -148,6 +149,22 @@ def test_what_is_packed_is_what_rosbags_and_rclpy_make_of_the_same_message(name:
     assert str(topic_of(channel).decode(serialize_message(message))) == str(message)  # NaN is not equal to itself
 
 
+def test_a_command_is_of_the_tip_or_in_the_needle_s_own_frame_and_nothing_else():
+    for velocity in (np.array([1e-3, -2e-3]), np.array([1e-3, -2e-3, 0.5])):
+        message = topics.NEEDLE_COMMAND.decode(packing.packed_twist(7, velocity))
+        assert reading.needle_command(message, "c").tolist() == velocity.tolist()
+        message.twist.linear.z = 1e-3
+        with pytest.raises(InvalidInputError, match="out of the plane"):
+            reading.needle_command(message, "c")
+    message = topics.NEEDLE_COMMAND.decode(packing.packed_twist(7, np.array([1e-3, 0.0])))
+    message.twist.angular.z = 0.5  # beside that which the velocity of the tip amounts to
+    with pytest.raises(InvalidInputError, match="apart from x and y"):
+        reading.needle_command(message, "c")
+    message.header.frame_id = "needle_elsewhere"
+    with pytest.raises(InvalidInputError, match="frame_id"):
+        reading.needle_command(message, "c")
+
+
 IN_A_RIG_WITH_A_PREFIX = """
 import numpy as np
 from magnetosuture_thread.settings import interface
@@ -167,6 +184,9 @@ for count in (0, 1, 5):
 pose = topics.NEEDLE_POSE.decode(packing.packed_pose(7, points[0], np.array([0.6, 0.8])))
 assert reading.needle_pose(pose).tail.tolist() == [0.0, 1.0]
 image = topics.COMPRESSED_IMAGE.decode(packing.packed_compressed_image(7, np.arange(9, dtype=np.uint8)))
+command = topics.NEEDLE_COMMAND.decode(packing.packed_twist(7, np.array([1e-3, 0.0, 0.5])))
+assert command.header.frame_id == interface.NEEDLE_FRAME
+assert reading.needle_command(command, "").tolist() == [1e-3, 0.0, 0.5]
 print(pose.header.frame_id, image.header.frame_id)
 """
 
