@@ -54,7 +54,7 @@ class NeedleMechanics:
         length: along the body [m].
         curvature: of its arc, positive to the left of the heading [1/m].
         moment: magnetic moment of the straight needle, from tail to tip [A m^2].
-        drag: force along the body for one m/s, with what the thread adds to it [N s/m].
+        drag: force along the body for one m/s [N s/m].
         drag_across: the same across the body [N s/m].
         turning_drag: torque for one rad/s [N m s].
         slack_drag: drag along the body while the thread is slack and adds nothing [N s/m].
@@ -130,16 +130,11 @@ class CoilAllocation:
         v . e = F . e / drag                                  F = q (B_tip - B_tail)
         v . n = F . n / drag_across + omega l / 2             omega = q l B . n / turning_drag
 
-    with the mean field B of both ends. They are the bounded least-squares solution of: both velocities;
-    a field B_0 along the needle, which holds its direction; the wanted drift by force across, none or what
-    compensates the needle's slip; and little current. The needle turns
-    against the remaining drift until it moves at a constant angle to its path. A zero velocity gives zero currents.
-
-    Where a slip is compensated, what errors of the coils (`COIL_ERROR`) and of the heading would do to drift and
-    direction counts too; that of the heading is min(`HEADING_ERROR` exp(`ERROR_GROWTH` age), `MAX_HEADING_ERROR`), as a
-    needle against a pull is in an unstable balance close to a coil's axis. Then omega alone follows the command, not
-    the sum of both terms, so that the needle turns as commanded also where it slips; and the field along it may fall to
-    `MIN_ALIGNING_SHARE` B_0, not below.
+    with the mean field B of both ends. They are the bounded least-squares solution of: the velocities along and across
+    by force, and the turn rate, as wanted; a field B_0 along the needle, which holds its direction; and little current.
+    What errors of the coils (`COIL_ERROR`) and of the heading would do to drift and direction counts too; that of the
+    heading is min(`HEADING_ERROR` exp(`ERROR_GROWTH` age), `MAX_HEADING_ERROR`), as a needle against a pull is in an
+    unstable balance close to a coil's axis. The field along the needle may fall to `MIN_ALIGNING_SHARE` B_0, not below.
 
     Source: none.
 
@@ -418,8 +413,8 @@ class CertifiedAllocation:
 
         I_hold + s (I - I_hold)    with the greatest s, 0 to 1, whose motion is certified together with the pull
 
-    Where even I_hold is not, as no currents keep the needle there, I - I_hold is certified by itself: else the needle
-    could not be turned to where there are. Without a pull I_hold is zero.
+    Where even I_hold is not, as no currents keep the needle there, I - I_hold is certified by itself, and so are then
+    all currents: else the needle could not be turned to where there are. Without a pull I_hold is zero.
 
     Args:
         coils: allocate the currents.
@@ -451,7 +446,7 @@ class CertifiedAllocation:
         at = pose.tail, pose.heading
 
         def allocated(wanted: NeedleTwist) -> tuple[Allocation, str]:
-            against = wanted.less(pull) if pull else wanted
+            against = wanted if pull is None else wanted.less(pull)
             allocation = self._coils.allocate(
                 against, *at, previous.currents, max_change, pose.age, at_tip=pull is None
             )
@@ -473,8 +468,10 @@ class CertifiedAllocation:
         hold, _ = allocated(NeedleTwist())
         if certified(hold)[0] < 1.0:
             added = drive.velocity - hold.velocity
-            share, by_itself = safety.safe_share(added, *at, drive.drift - hold.drift)
-            return hold.towards(drive, share), by_itself or name
+            kept = hold.towards(drive, safety.safe_share(added, *at, drive.drift - hold.drift)[0])
+            # The pull apart, these currents may not bring the needle too close: the hold is limited in its change too.
+            share, by_itself = safety.safe_share(kept.velocity, *at, kept.drift)
+            return kept.scaled(share), by_itself or name
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)

@@ -33,6 +33,9 @@ OPERATOR, NEEDLE = "operator", "needle"
 INPUTS = {OPERATOR: "operator/servo_cv", NEEDLE: "needle/servo_cv"}  # topics, by priority
 
 LOOKAHEAD_PERIODS = 2.0  # in which command and pose must stay valid: one to the next step, one to the boards
+SWIFT = 1e3  # m/s and rad/s; faster than anything, so that no product overflows
+MIN_JUDGED = 0.2  # s; poses that are no farther apart are judged, also by a bridge that takes none so old
+STILL = "a motion that leaves the tip where it is"
 NO_SCENE, NO_POSE = "no scene", "no needle pose"
 NO_PREDICTION, CURRENT_LIMIT = "no prediction", "current"  # constraints of the bridge, besides those of the filter
 
@@ -102,15 +105,19 @@ class _SelectedInput(NamedTuple):
     tip: Vector = NO_VELOCITY
 
 
+def _selected(source: str, overridden: str, command: Vector) -> _SelectedInput:
+    """Return the input that is followed; what the tip makes of a motion of the needle is known with its pose."""
+    return _SelectedInput(source, overridden, command, tip=command if len(command) == 2 else NO_VELOCITY)
+
+
 class CoilBridge:
     """Converts the last valid command into coil currents at a fixed rate, and to zero on any stop condition.
 
     There are two inputs: commands of `operator` have priority over those of `needle`, which are followed again when
-    the operator's are stale. A step filters the command of the selected input by `NeedleSafetyFilter` and allocates
-    the coil currents at the extrapolated pose, within the limits of current and slew. The velocity of the allocated
-    currents differs slightly from the filtered one: the currents are scaled, all by one factor, by the share of
-    their velocity that the filter certifies for as long as the coils may hold it. A stop, a zero command and that
-    factor take effect at once, without the limits on change.
+    the operator's are stale. A step limits the command of the selected input, filters it by `NeedleSafetyFilter` if it
+    is a velocity of the tip, and allocates the coil currents at the extrapolated pose, within the limits of current and
+    slew. Of them, as much is set as the filter certifies for as long as the coils may hold it, see
+    `CertifiedAllocation`. A stop, a zero command and that share take effect at once, without the limits on change.
 
     Pure: it reads no clock. `arrival` is a monotonic time, `now` the time of the stamps; both in seconds.
 
@@ -147,7 +154,9 @@ class CoilBridge:
             max_hold=settings.hold_time,
         )
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
-        self._observer = MotionObserver(kinematics, self._hold, settings.max_speed, settings.pose_timeout)
+        self._observer = MotionObserver(
+            kinematics, self._hold, settings.max_speed, max(MIN_JUDGED, settings.pose_timeout)
+        )
         slack_ratio = needle.drag / needle.slack_drag
         self._follow = FollowMonitor(settings.pose_uncertainty, slack_ratio)
         self._settings, self._gains, self._allocation = settings, settings.gain_estimator(), settings.allocation()
@@ -202,6 +211,8 @@ class CoilBridge:
             arrival: a monotonic clock now [s].
         """
         self.stamp_ages.add(INPUTS[source], now - stamp, arrival)
+        if source == OPERATOR and len(command) != 2:
+            raise InvalidInputError(INPUTS[source], "a motion in the frame of the needle", "the velocity of the tip")
         self.watchdogs[source].update(command, stamp, number, now, arrival)
 
     def on_pose(
@@ -290,6 +301,10 @@ class CoilBridge:
         then = (now + LOOKAHEAD_PERIODS * period, arrival + LOOKAHEAD_PERIODS * period)
         selected = self._select_input(*then)
         pose = self.extrapolator.pose(now, arrival)
+        in_needle_frame, commanded = len(selected.command) == 3, NeedleTwist()
+        if pose is not None and in_needle_frame:
+            commanded = NeedleTwist(*np.clip(selected.command, -SWIFT, SWIFT).tolist())
+            selected = selected._replace(tip=self._needle.kinematics.tip_velocity(pose.heading, commanded))
         no_prediction = self.prediction_monitor.stale_reason(now, arrival)
         reasons = self._stop_reasons(arrival, then, driver, selected, no_prediction)
         active: tuple[str, ...] = (NO_PREDICTION,) if no_prediction else ()
@@ -298,7 +313,9 @@ class CoilBridge:
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
             return self._zero_output(now, arrival, selected, reasons, active)
         if self._follow.probe_rate and selected.command.any():
-            selected = selected._replace(command=np.array([0.0, 0.0, self._follow.probe_rate]))
+            in_needle_frame, commanded = True, NeedleTwist(turn_rate=self._follow.probe_rate)
+            tip = self._needle.kinematics.tip_velocity(pose.heading, commanded)
+            selected = selected._replace(command=np.array(commanded), tip=tip)
         if not selected.command.any():
             self._follow.end_probe()
             output, self._stopped = replace(self._zero_output(now, arrival, selected, ()), publish=True), None
@@ -309,17 +326,17 @@ class CoilBridge:
         slowed = selected.source == OPERATOR or settings.friction_feedback == "all"
         slowdown = self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0
         kinematics, pull = self._needle.kinematics, self._observer.pull(pose.heading) if compensates else None
-        if len(selected.command) == 3:
+        if in_needle_frame:
             self._filter.set_time(now, self.extrapolator.first_stamp)
-            commanded = NeedleTwist(*selected.command.tolist())
-            tip = kinematics.tip_velocity(pose.heading, commanded)
-            selected = selected._replace(tip=tip)
-            swiftest = max(math.hypot(*tip), math.hypot(commanded.along, commanded.across))
-            limited = min(slowdown, max_speed / swiftest)
-            twist, wanted = commanded.scaled(limited), limited * tip
+            # Of the end that is turned ahead, which is the swifter one.
+            swiftest = math.hypot(commanded.along, abs(commanded.across) + kinematics.lever * abs(commanded.turn_rate))
+            limited = min(slowdown, max_speed / max(swiftest, 1e-300))
+            twist = commanded.scaled(limited)
+            wanted = kinematics.tip_velocity(pose.heading, twist)
+            if not compensates:  # what is driven across the needle counts as a part of its turn
+                twist = kinematics.twist(pose.heading, wanted)
             active += tuple(filter(None, (FRICTION if slowdown < 1.0 else "", SPEED if limited < slowdown else "")))
         else:
-            selected = selected._replace(tip=selected.command)
             filtered = self._filter.filter(
                 selected.command,
                 pose.tail,
@@ -340,6 +357,8 @@ class CoilBridge:
                 room = max(0.0, room)  # while the needle slows down to another limit it is still faster
                 aside = min(room, max(-room, self._filter.sidestep(pose.tail, pose.heading)))
             twist = kinematics.twist(pose.heading, wanted)._replace(across=aside)
+        if not compensates and not wanted.any():
+            return self._zero_output(now, arrival, selected, (rest_reason(list(active) or [STILL]),), active, slowdown)
         max_change = settings.max_current_slew * elapsed
         allocation, limiting = self._coils.allocate(twist, pose, self._filter, self._previous, max_change, pull)
         limits = limiting, CURRENT_LIMIT if allocation.saturated else ""
@@ -354,7 +373,8 @@ class CoilBridge:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, slowdown)
-        self._previous, self._velocity, self._stopped = allocation, wanted, None
+        self._previous, self._stopped = allocation, None
+        self._velocity = expected if in_needle_frame else wanted
         self.extrapolator.apply_velocity(expected, now, arrival, own_drift + pulled.across)
         given = kinematics.twist(pose.heading, allocation.velocity, own_drift)
         e = kinematics.chord_direction(pose.heading)
@@ -374,12 +394,12 @@ class CoilBridge:
         problem = operator.stale_reason(now, arrival)
         if not problem:
             overridden = "" if needle.is_empty or needle.stale_reason(now, arrival) else NEEDLE
-            return _SelectedInput(OPERATOR, overridden, operator.velocity)
+            return _selected(OPERATOR, overridden, operator.velocity)
         if operator.has_conflict(arrival):
             return _SelectedInput(problem=problem)
         other = needle.stale_reason(now, arrival)
         if not other:
-            return _SelectedInput(NEEDLE, "", needle.velocity)
+            return _selected(NEEDLE, "", needle.velocity)
         # An input that was never used does not explain why there is no command now.
         return _SelectedInput(problem=problem if needle.is_empty and not needle.has_conflict(arrival) else other)
 

@@ -356,11 +356,6 @@ class PoseExtrapolator:
         self._applied_at = -math.inf  # monotonic time at which it was applied
         self._history: deque[tuple[float, BodyVelocity]] = deque()  # velocities, each with its start
 
-    @property
-    def chord(self) -> float:
-        """Distance from the needle's tail to its tip [m]."""
-        return self._needle.chord
-
     def update(
         self,
         tail: Vector,

@@ -18,7 +18,7 @@ PULL_NOISE = 1e-4  # m^2/s^3; a pull changes by 10 mm/s, root mean square, in 1 
 VISIBLE = 6e-5  # m; four times the noise of a displacement between two poses
 MAX_STILL = 0.3  # s; after which poses that have not visibly moved are the place that the next ones are compared with
 MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
-MIN_WINDOW = 0.15  # s; two time constants of the motion observer, in which it compensates a pull that has changed
+MIN_WINDOW = 0.15  # s; three poses of 20 a second, in which a pull that has changed is compensated
 MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
 MIN_DISTANCE = 2e-4  # m; ten times the noise of a measured pose
 SHAPE_FACTOR = 4.0  # on that, for a needle at wall or shape: 2 mm with the default pose_uncertainty
@@ -65,6 +65,7 @@ class MotionObserver:
         max_interval: float = MAX_GAP,
     ) -> None:
         self._needle, self._min_hold, self._max_speed, self._max_interval = needle, min_hold, max_speed, max_interval
+        limit_pair(0.0, 0.0, max_speed)  # loaded now, and not within the loop
         self._place, self._velocity, self._covariance = np.zeros(2), np.zeros(2), np.zeros((2, 2))
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
         self._seen: tuple[float, Vector] | None = None  # the last pose that counted

@@ -123,6 +123,11 @@ class NeedleKinematics:
         """Distance from tail to tip [m]."""
         return self._chord[0]
 
+    @property
+    def lever(self) -> float:
+        """Half of the chord: the distance of both ends from the middle [m]."""
+        return 0.5 * self.chord
+
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
         _, c, s = self._chord

@@ -68,9 +68,9 @@ class CoilBridgeSettings(
     zero_hold: float = quantity(
         1.0, "after a stop, zero currents are published for this long", unit="s", minimum=0.1, maximum=60.0
     )
-    max_speed: float = quantity(0.02, "maximum speed of the needle's tip", unit="m/s", minimum=1e-5, maximum=0.5)
+    max_speed: float = quantity(0.02, "maximum speed of the needle's ends", unit="m/s", minimum=1e-5, maximum=0.5)
     max_acceleration: float = quantity(
-        0.5, "maximum acceleration of the tip; a stop is not limited", unit="m/s^2", minimum=1e-3, maximum=100.0
+        0.5, "maximum acceleration of a tip whose velocity is commanded; a stop is not limited", unit="m/s^2", minimum=1e-3, maximum=100.0
     )
     max_current: float = quantity(
         10.0, "maximum current in a coil, in either direction", unit="A", minimum=0.01, maximum=100.0

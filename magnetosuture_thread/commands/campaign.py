@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,6 +15,7 @@ import numpy as np
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.replay import picture_or_log
@@ -224,4 +226,6 @@ def _draw_failed_run(axes: Axes, failed: run.RunResult, result: CampaignResult) 
             axes.plot(*(1e3 * end.path.T), color="#f28c28", linewidth=1.0, linestyle=(0, (4, 2)))
         length = float(np.linalg.norm(end.axis[-1] - end.axis[0]))  # of the arrow at the allowed speed
         scale = 1e3 * length / result.procedure.limits[0].speed
-        plots.draw_arrow(axes, 1e3 * end.axis[-1], scale * end.frame.commanded)
+        heading = np.array([math.cos(end.frame.heading), math.sin(end.frame.heading)])
+        velocity = result.setup.coils.needle().kinematics.tip_velocity(heading, NeedleTwist(*end.frame.commanded))
+        plots.draw_arrow(axes, 1e3 * end.axis[-1], scale * velocity)

@@ -484,7 +484,8 @@ class ProcedureExecutor:
             return
         self._drop_path()
         if stopped.any():
-            self._back_off, self._back_off_until = -stopped, stamp + BACK_OFF_TIME
+            back = -stopped * (1.0, 1.0, 0.0)  # without its turn, which would go on for all of that time
+            self._back_off, self._back_off_until = back, stamp + BACK_OFF_TIME
 
     def _next_goal(self) -> None:
         """Plan the next goal from the next pose; or be done, unless the thread has slipped off a shape."""

@@ -1,4 +1,4 @@
-"""Path tracking: which tip velocity takes the needle's body along planned poses."""
+"""Path tracking: which motion takes the needle's body along planned poses."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class PathTracker:
     The direction corrects the place where force cannot: delta = s sign(u_r) atan(y / `LOOKAHEAD`), with the error y
     across the path, the share s of the way that is driven, not turned on the spot, and a weight that falls to
     `MIN_STEERED` where force has plenty in reserve. Along the axes of the coils no currents give a force across the
-    needle. Where a pull d across an axis is measured, theta stays off it by min(|d| / a, `MAX_AXIS_ANGLE`), with the
+    needle. Where a pull d is measured, theta stays off them by min(|d| / a, `MAX_AXIS_ANGLE`), with the
     velocity a that the coils hold for each radian, on the side of theta_r, and jumps to the other side when theta_r
     crosses. A thread that holds the tail displaces the middle in that turn: before it the place is b, half of that to
     the side that the needle comes from. All of theta - theta_r stays within what half of the path's leeway allows.

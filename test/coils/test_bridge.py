@@ -274,6 +274,49 @@ def test_the_needle_never_comes_closer_than_it_may(
     assert least < 0.003  # it did get there
 
 
+@pytest.mark.parametrize(("compensates", "slew"), [(False, 1000.0), (True, 1000.0), (True, 10.0)])
+@pytest.mark.parametrize("twist", [(-0.01, 0.004, 0.0), (0.0, 0.004, 0.0), (0.005, -0.004, 2.0), (0.01, 0.0, 0.0)])
+def test_a_motion_in_its_own_frame_brings_the_needle_no_closer_than_it_may(
+    twist: tuple[float, ...], compensates: bool, slew: float
+):
+    """Also with currents that change slowly, where those that would hold the needle cannot be had at once."""
+    settings = CoilBridgeSettings(motion_compensation=compensates, max_current_slew=slew)
+    scene = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.006, 0.004), 0.002)),))
+    plant, safety = Plant(settings, scene, velocity=twist).ready(), settings.safety_filter(scene)
+    motion = driven(plant, 600, tail=TAIL - np.array([0.004, 0.0]), latency=4, interval=10)
+    least = min(safety.clearance(tail, heading) for tail, heading in motion)
+    assert least > settings.keep_out - 1e-9
+    assert not plant.bridge.latch.fault
+
+
+@pytest.mark.parametrize("compensates", [False, True])
+@pytest.mark.parametrize(
+    "twist", [(0.0, 0.0, 5e-324), (0.0, 1.79e308, 1.79e308), (-1e300, 0.0, 1e-300), (0.0, 0.0, 1e6)]
+)
+def test_a_hostile_motion_is_limited_and_no_fault(twist: tuple[float, ...], compensates: bool):
+    plant = Plant(CoilBridgeSettings(motion_compensation=compensates), velocity=twist).ready()
+    outputs = plant.run(0.3)
+    assert all(
+        np.isfinite([*output.allocation.currents, *output.commanded, *output.filtered]).all() for output in outputs
+    )
+    assert not plant.bridge.latch.fault
+
+
+def test_both_ends_of_a_needle_go_no_faster_than_the_greatest_speed():
+    settings = CoilBridgeSettings(max_speed=0.004, max_current=100.0)
+    lever = settings.needle().kinematics.lever
+    plant = Plant(settings, velocity=(0.0, 0.004, -0.004 / lever)).ready()  # the tip rests, and the tail sweeps
+    output = plant.run(0.3)[-1]
+    assert math.hypot(*output.filtered) < 1e-9
+    assert "speed" in output.active
+
+
+def test_an_operator_commands_the_tip_alone():
+    plant = Plant().ready()
+    with pytest.raises(InvalidInputError, match="operator/servo_cv"):
+        plant.bridge.command("operator", np.array([1e-3, 0.0, 0.1]), plant.time, 1, plant.time, plant.time)
+
+
 def test_a_pose_error_within_pose_margin_brings_the_needle_no_closer_than_keep_out():
     """Each pose is measured 20 um farther from the wall than the needle is, which the bridge cannot know."""
     error, least = 2e-5, {}

@@ -12,6 +12,7 @@ import pytest
 import magnetosuture_thread.rig.campaign as campaign
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
+from magnetosuture_thread.commands.campaign import CampaignResult, draw_campaign
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
 from magnetosuture_thread.rig.campaign import RunResult, run_procedure, vary
@@ -135,3 +136,5 @@ def test_with_the_camera_the_tracker_measures(hernia: Setup, short: Procedure, m
     moved = [instant.frame.commanded.any() for instant in found.last_instants]
     assert any(moved)
     assert not moved[0]
+    assert moved[-1], "the picture of a run that failed has an arrow"
+    assert draw_campaign(CampaignResult(short, hernia, True, [found])).startswith(b"\x89PNG")
