@@ -70,7 +70,11 @@ class CoilBridgeSettings(
     )
     max_speed: float = quantity(0.02, "maximum speed of the needle's ends", unit="m/s", minimum=1e-5, maximum=0.5)
     max_acceleration: float = quantity(
-        0.5, "maximum acceleration of a tip whose velocity is commanded; a stop is not limited", unit="m/s^2", minimum=1e-3, maximum=100.0
+        0.5,
+        "maximum acceleration of a tip whose velocity is commanded; a stop is not limited",
+        unit="m/s^2",
+        minimum=1e-3,
+        maximum=100.0,
     )
     max_current: float = quantity(
         10.0, "maximum current in a coil, in either direction", unit="A", minimum=0.01, maximum=100.0
