@@ -35,7 +35,7 @@ class Plant:
     scene: Scene | None = field(default_factory=Scene)
     thread: bool = True
     time: float = 100.0
-    velocity: tuple[float, float] | None = (0.005, 0.002)
+    velocity: tuple[float, ...] | None = (0.005, 0.002)  # of the tip, or the motion in the needle's frame
     tail: NDArray[np.float64] | None = field(default_factory=lambda: TAIL.copy())
     driver: DriverState = READY
     outputs: list[tuple[float, BridgeOutput]] = field(default_factory=list)
@@ -71,7 +71,7 @@ class Plant:
 
     def command(
         self,
-        velocity: tuple[float, float],
+        velocity: tuple[float, ...],
         stamp: float | None = None,
         number: int | None = None,
         source: str = "needle",
