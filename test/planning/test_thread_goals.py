@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
+from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.planning.executor import ProcedureExecutor, ThreadCondition
@@ -234,8 +235,9 @@ def test_a_path_that_does_not_lead_to_the_goal_any_more_is_planned_anew(planner:
     tail, heading, kinematics = np.array([0.012, -0.012]), np.array([0.0, 1.0]), planner.needle
     thread = ThreadCondition(between((0.012, -0.012), (0.012, -0.02)))
     for k in range(200):
-        velocity = executor.update(0.05 * k, tail, heading, thread)
-        tail, heading = kinematics.moved(tail, heading, *kinematics.body_velocity(heading, velocity), 0.05)
+        twist = NeedleTwist(*executor.update(0.05 * k, tail, heading, thread))
+        across = twist.across + kinematics.lever * twist.turn_rate
+        tail, heading = kinematics.moved(tail, heading, twist.along, across, 0.05, twist.across)
         if asked.count("plan") > 1:
             break
     assert asked[:2] == ["plan", "leads_to"]
