@@ -10,6 +10,7 @@ import tempfile
 import uuid
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 
@@ -18,6 +19,10 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.rig.setups import read_setup
+
+# The first example of a process may load compiled code, and other processes may have the cores.
+hypothesis.settings.register_profile("without deadline", deadline=None)
+hypothesis.settings.load_profile("without deadline")
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # What a shell runs in the background ignores SIGINT, and hands that on to its children: no Ctrl-C would reach them.
