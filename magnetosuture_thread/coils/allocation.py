@@ -201,7 +201,7 @@ class CoilAllocation:
             max_change: maximum change of each current [A].
             age: time since the pose was measured [s].
             at_tip: whether the tip is to move as it would by that motion: then the needle turns against what the
-                currents add across it. Else it turns as it is told, whatever they add.
+                currents add across it, and errors do not count. Else it turns as commanded.
         """
         needle = self._needle
         e = needle.chord_direction(heading)
@@ -224,6 +224,8 @@ class CoilAllocation:
         growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
         beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
         misaligned = HEADING_ERROR * math.exp(growth) / HEADING_STEP * (self._rows(middle, beside)[1] - across)
+        if at_tip:  # a drift by such an error is corrected by the turn, as any other
+            effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
         system = np.vstack(
             [
                 along / along_speed,
