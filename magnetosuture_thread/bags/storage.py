@@ -23,7 +23,9 @@ from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
 
 CDR = "cdr"  # how ROS 2 writes messages
 METADATA_FILE = "metadata.yaml"
-COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in STORAGE_SUFFIXES)
+# What unpacks a file that is compressed as a whole: by rosbag2, which names zstd's so, or by hand.
+UNPACKERS = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "lz4 -d"}
+COMPRESSED_SUFFIXES = tuple(f"{suffix}{packed}" for suffix in STORAGE_SUFFIXES for packed in UNPACKERS)
 QOS, TYPE_HASH = "offered_qos_profiles", "topic_type_hash"  # metadata of a connection, in mcap and in sqlite3
 NOTES = "magnetosuture"  # name of the mcap record that holds our notes, and prefix of our entries in metadata.yaml
 SALVAGED_NOTE = "unverified"  # note of a bag that an earlier version salvaged without checksums: why it may be wrong
@@ -284,20 +286,21 @@ def find_bag_files(path: Path) -> BagFiles:
     except Exception as error:  # The file system of a URL raises whatever its library does.
         raise BagError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     files = {file.name: file for file in entries if file.suffix in STORAGE_SUFFIXES}
-    packed = [file.name for file in entries if file.name.endswith(COMPRESSED_SUFFIXES) and file.stem not in files]
-    advice = "is compressed as a whole; decompress it first: zstd -d"
+    names = [file.name for file in entries if file.name.endswith(COMPRESSED_SUFFIXES) and file.stem not in files]
+    advice = "is compressed as a whole; decompress it first:"
+    packed = {Path(name).stem: f"{advice} {UNPACKERS[Path(name).suffix]} {name}" for name in names}
     if packed and not files:
-        raise BagError(path, f"{advice} {packed[0]}")
+        raise BagError(path, next(iter(packed.values())))
     if is_file:
         return BagFiles([path])
     # Those of ROS 1 are named when they are opened.
     files = files or {file.name: file for file in entries if file.suffix == ".bag"}
     if not files:
         raise BagError(path, f"holds no {' or '.join(STORAGE_SUFFIXES)} file")
-    bag = BagFiles([*files.values()], [CorruptRegion(name, 0, 0, f"{advice} {name}") for name in packed])
-    listed = [name.removesuffix(".zstd") for name in _read_metadata(path, bag)]
+    bag = BagFiles([*files.values()], [CorruptRegion(name, 0, 0, packed[Path(name).stem]) for name in names])
+    listed = [Path(name).stem if name.endswith(COMPRESSED_SUFFIXES) else name for name in _read_metadata(path, bag)]
     if any(name in files for name in listed):
-        absent = [name for name in listed if name not in files and f"{name}.zstd" not in packed]
+        absent = [name for name in listed if name not in files and name not in packed]
         bag.lost += [CorruptRegion(name, 0, 0, "is missing") for name in absent]
         bag.remarks += [f"{name} is not read: {METADATA_FILE} does not list it" for name in files if name not in listed]
         bag.files = [files[name] for name in listed if name in files]

@@ -12,11 +12,13 @@ import errno
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from time import sleep
 from typing import TYPE_CHECKING, Any
 
 import yaml
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
+DISK_PERIOD = 0.001  # s, between looks at whether the disk has taken a chunk
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
 
 Message = tuple[int, int, bytes, int, int]  # arguments of `mcap.writer.Writer.add_message`
@@ -71,13 +74,15 @@ class BagWriter:
         self._pending: list[Message] = []
         self._bytes, self._first, self._last = 0, MAX_TIME, 0  # of the pending messages
         self._defined = 0  # connections when the last chunk was begun
+        self._handed = 0  # chunks that the worker was given
         self._closed = False
         # What follows is of the worker.
+        self._taken = 0  # chunks that are done with
         self._schemas: dict[MessageDefinition, int] = {MessageDefinition(""): 0}
         self._registered = 0  # connections that the file has
         self._counts: Counter[int] = Counter()
         self._start, self._end = MAX_TIME, 0
-        self._problem: OSError | None = None
+        self._problem: Exception | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
@@ -94,8 +99,10 @@ class BagWriter:
                 self._file.unlink()  # of no use, but in the way of the next attempt
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
         self._size = self._stream.tell()
-        self._worker = ThreadPoolExecutor(1, "bag_writer")
-        self._written: Future[None] | None = None
+        # Not an executor: its locks are Python's, which an interrupt can leave held for ever.
+        self._chunks: SimpleQueue[tuple[int, list[Message]] | None] = SimpleQueue()  # connections, and messages
+        self._worker = Thread(target=self._work, name="bag_writer", daemon=True)  # nobody waits for one left open
+        self._worker.start()
 
     def __enter__(self) -> BagWriter:
         """Use the writer in a with statement, which closes it."""
@@ -152,25 +159,28 @@ class BagWriter:
 
         Otherwise as `write`.
         """
-        if not 0 <= time <= MAX_TIME:
-            topic = self._connections[number - 1].topic
-            raise BagError(topic, f"a message of the time {time} ns; expected 0 to {MAX_TIME}")
+        published = time if publish_time is None else publish_time
+        for each in (time, published):
+            if not 0 <= each <= MAX_TIME:
+                topic = self._connections[number - 1].topic
+                raise BagError(topic, f"a message of the time {each} ns; expected 0 to {MAX_TIME}")
         if self._closed:
             raise BagError(self.folder, "is closed; nothing more can be written to it")
         sequence = self._sequences[number] if sequence is None else sequence
-        self._pending.append((number, time, data, time if publish_time is None else publish_time, sequence))
+        self._pending.append((number, time, data, published, sequence))
         self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
         self._bytes += len(data)
         self._first, self._last = min(self._first, time), max(self._last, time)
         is_full = self._bytes > MAX_CHUNK_BYTES or self._last - self._first > MAX_CHUNK_SPAN
         # Without the definition of its topic a message is lost: it comes in a chunk that is too small to be hit.
         if is_full or number > self._defined:
-            if self._written is not None:
-                self._written.result()  # so that at most two chunks wait for the disk
+            while self._handed > self._taken:  # so that at most two chunks wait for the disk
+                sleep(DISK_PERIOD)
             if self._problem is not None:
                 self.close()
             self._defined = len(self._connections)
-            self._written = self._worker.submit(self._write_chunk, self._pending)
+            self._chunks.put((self._defined, self._pending))
+            self._handed += 1
             self._pending, self._bytes, self._first, self._last = [], 0, MAX_TIME, 0
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
@@ -186,23 +196,44 @@ class BagWriter:
         """
         if self._closed:
             return
+        self._chunks.put((len(self._connections), self._pending))
+        self._chunks.put(None)
         self._closed = True
-        self._worker.submit(self._finish, self._pending).result()
-        self._worker.shutdown()
-        if self._problem is not None:
+        try:
+            self._worker.join()
+        finally:  # also of an interrupt in that time, which is short
+            self._worker.join()
+        if isinstance(self._problem, OSError):
             kept = pluralize(self._counts.total(), "message")
             texts = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
             what = texts.get(self._problem.errno or 0, f"fails ({self._problem.strerror})")
             raise RecordingEndedError(self.folder, f"the disk {what} after {kept}", self._file) from None
+        if self._problem is not None:
+            raise self._problem
 
-    def _write_chunk(self, pending: list[Message]) -> None:
-        """Write messages as a chunk, and take them from the list: it may come again where its owner was interrupted."""
+    def _work(self) -> None:
+        """Write chunks until there are no more, then what ends the file."""
+        chunk: tuple[int, list[Message]] | None = (0, [])
+        while chunk is not None:
+            chunk = self._chunks.get()
+            try:
+                self._finish() if chunk is None else self._write_chunk(*chunk)
+            except Exception as error:  # raised by `close`
+                self._problem = error
+            self._taken += 1
+
+    def _write_chunk(self, connections: int, pending: list[Message]) -> None:
+        """Write messages as a chunk, and take them from the list: it may come again where its owner was interrupted.
+
+        The connections that are written with it are those that were known then, so that the same calls give the same
+        bytes.
+        """
         messages = pending[:]
         del pending[: len(messages)]
-        if self._problem is not None or not messages:
+        if isinstance(self._problem, OSError) or not messages:
             return
         try:
-            self._register()
+            self._register(connections)
             for message in messages:
                 self._mcap.add_message(*message)
             self._mcap.flush()
@@ -214,9 +245,9 @@ class BagWriter:
         times = [message[1] for message in messages]
         self._start, self._end = min(self._start, *times), max(self._end, *times)
 
-    def _register(self) -> None:
-        """Write the connections that were added since the last chunk."""
-        for connection in self._connections[self._registered :]:
+    def _register(self, count: int) -> None:
+        """Write the first connections, up to a count, that are not in the file yet."""
+        for connection in self._connections[self._registered : count]:
             definition = connection.definition
             if definition not in self._schemas:
                 text = definition.text.encode("utf-8", "surrogateescape")
@@ -225,13 +256,12 @@ class BagWriter:
             self._mcap.register_channel(connection.topic, connection.serialization, schema, metadata)
             self._registered += 1
 
-    def _finish(self, pending: list[Message]) -> None:
-        """Write the last chunk, the summary and metadata.yaml."""
-        self._write_chunk(pending)
-        if self._problem is not None:
+    def _finish(self) -> None:
+        """Write the summary and metadata.yaml."""
+        if isinstance(self._problem, OSError):
             return
         try:
-            self._register()
+            self._register(len(self._connections))
             information = self._information()
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)})
             self._mcap.finish()

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.bags.storage import UNPACKERS, MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
@@ -144,20 +144,21 @@ def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
 
 
 @pytest.mark.parametrize("has_metadata", [True, False])
-def test_parts_that_are_compressed_as_a_whole_are_named(tmp_path: Path, has_metadata: bool):
-    """As `ros2 bag record --compression-mode file` leaves them after a crash, and `ros2 bag play` after some parts."""
+@pytest.mark.parametrize(("packed", "remedy"), UNPACKERS.items())
+def test_parts_that_are_compressed_as_a_whole_are_named(tmp_path: Path, has_metadata: bool, packed: str, remedy: str):
+    """As recorder or player of rosbag2 leave them after a crash or some parts, or a person who saves space."""
     names = [f"run_{part}.mcap" for part in range(3)]
     for part, name in enumerate(names):
         file = write_mcap(tmp_path / name, texts(20, start=(1 + part) * 10**9), {"/text": STRING})
-        (tmp_path / f"{name}.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+        (tmp_path / f"{name}{packed}").write_bytes(zstandard.compress(file.read_bytes()))
     (tmp_path / names[1]).unlink()
     if has_metadata:
-        lines = "".join(f"  - {name}.zstd\n" for name in names)
+        lines = "".join(f"  - {name}{packed}\n" for name in names)
         (tmp_path / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{lines}")
     bag = Bag(tmp_path)
     assert bag.counts == {"/text": 40}
     assert bag.damage is not None
-    advice = "run_1.mcap.zstd is compressed as a whole; decompress it first: zstd -d run_1.mcap.zstd"
+    advice = f"run_1.mcap{packed} is compressed as a whole; decompress it first: {remedy} run_1.mcap{packed}"
     assert [str(region) for region in bag.damage.regions] == [advice]
 
 

@@ -6,12 +6,16 @@ import contextlib
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import STRING, cdr, read
 
 # Writes messages that cannot be packed until something stops it, and says how many.
@@ -81,7 +85,7 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
     assert (
         bag.counts["/noise"] >= said - 16
     )  # a chunk holds seven or eight: one is filled, one is on its way to the disk
-    assert [time for _, time, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
+    assert [each for _, each, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
 
 
 def test_whatever_interrupts_a_recorder_what_it_wrote_is_whole(tmp_path: Path):
@@ -107,3 +111,48 @@ def test_whatever_interrupts_a_recorder_what_it_wrote_is_whole(tmp_path: Path):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+
+
+def test_the_bytes_of_a_bag_do_not_depend_on_when_its_worker_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write_chunk = BagWriter._write_chunk
+    for name in ("early", "late"):
+        known = threading.Event()
+
+        def when_known(self: BagWriter, *chunk: Any, known: threading.Event = known) -> None:
+            known.wait()
+            write_chunk(self, *chunk)
+
+        monkeypatch.setattr(BagWriter, "_write_chunk", when_known)
+        with BagWriter(tmp_path / name, name="bag") as bag:
+            bag.add_topic("/first", STRING)
+            bag.write("/first", 0, cdr(STRING, "0"))
+            if name == "early":
+                known.set()
+                while bag._taken < bag._handed:
+                    time.sleep(0.001)
+            bag.add_topic("/second", STRING)
+            known.set()
+            bag.write("/second", 1, cdr(STRING, "1"))
+    for file in ("bag_0.mcap", "metadata.yaml"):
+        assert (tmp_path / "early" / file).read_bytes() == (tmp_path / "late" / file).read_bytes()
+
+
+def test_a_bag_that_nobody_closes_lets_its_process_end(tmp_path: Path):
+    program = "import sys; from magnetosuture_thread.bags.writer import BagWriter; from pathlib import Path; "
+    program += "bag = BagWriter(Path(sys.argv[1])); bag.add_topic('/text', 'std_msgs/msg/String')"
+    subprocess.run([sys.executable, "-c", program, str(tmp_path / "bag")], check=True, timeout=60.0)
+
+
+@pytest.mark.parametrize(("received", "published"), [(-1, 0), (1, -1), (1, 1 << 64)])
+def test_a_message_of_a_time_that_cannot_be_is_refused_and_costs_no_other(
+    tmp_path: Path, received: int, published: int
+):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", STRING)
+        bag.write("/text", 0, cdr(STRING, "0"))
+        with pytest.raises(BagError, match="a message of the time"):
+            bag.write_to(1, received, cdr(STRING, "1"), publish_time=published)
+        bag.write("/text", 2, cdr(STRING, "2"))
+    found = Bag(tmp_path / "bag")
+    assert found.damage is None
+    assert [each for _, each, _ in read(found)] == [0, 2]
