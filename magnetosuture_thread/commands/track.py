@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from magnetosuture_thread import InvalidInputError, read_scene
+from magnetosuture_thread import InvalidInputError, Scene, read_scene
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
@@ -28,14 +28,16 @@ from magnetosuture_thread.evaluation.metrics import SensorSilence
 from magnetosuture_thread.evaluation.recorded import read_image
 from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.geometry.thread_observation import ThreadPiece
-from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.rig.setups import read_vision_setup
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES, read_regular
 from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES, Channel
-from magnetosuture_thread.vision.images import decode_image
+from magnetosuture_thread.vision.images import decode_image, upright
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
-from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_region
-from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
+from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_refused, draw_region
+from magnetosuture_thread.vision.refused import Refused, refused_needles
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import NO_NEEDLE, State, Track, VisionTracker, no_pose, warm_up
 from magnetosuture_thread.vision.video import VIDEOS, Video
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -46,29 +48,59 @@ def add(parser: argparse.ArgumentParser) -> None:
     command.runs(parser, run_track)
     option = parser.add_argument
     command.add_frames(parser)
+    add_view(parser)
+    needle = "the needle's length, known within 10 %%, and the width of its body [m] (default: the setup's)"
+    option("--needle", type=command.number_argument(5e-5, 0.05), nargs=2, metavar=("LENGTH", "WIDTH"), help=needle)
+    bright = "greatest brightness of the needle, as a share of the floor's (default: the setup's)"
+    option("--needle-brightness", type=command.number_argument(0.1, 0.95), metavar="SHARE", help=bright)
+    tip, pixel = parser.add_mutually_exclusive_group(), command.number_argument(0.0, 1e5)
+    where = "a point near the needle's tip in the first frame that shows it, in the dish frame [m]"
+    tip.add_argument("--tip", type=command.number_argument(-0.25, 0.25), nargs=2, metavar=("X", "Y"), help=where)
+    tip.add_argument("--tip-px", type=pixel, nargs=2, metavar=("U", "V"), help="the same in the frame [px]")
+    option("--json", type=command.output_file, metavar="FILE", help="write what was found to a file")
+    overlay = "draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
+    option("--overlay", type=Path, metavar="PATH", help=overlay)
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """Add the setup, and what of its dish and view is chosen in place of it."""
+    option = parser.add_argument
     setup = "a setup's name or YAML file (default: %(default)s)"
     option("--setup", default="petri_35mm_polyamide", metavar="NAME", help=setup)
-    option("--scene", default="", metavar="NAME", help="a scene's name or file (default: the setup's)")
+    scene = parser.add_mutually_exclusive_group()
+    scene.add_argument("--scene", default="", metavar="NAME", help="a scene's name or file (default: the setup's)")
+    diameter = "inner diameter of a dish with nothing in it, in place of a scene [m]"
+    scene.add_argument("--dish-diameter", type=command.number_argument(0.005, 0.5), metavar="D", help=diameter)
     scale = "the scale (default: the setup's, or from the dish's diameter)"
     option("--metres-per-pixel", type=command.number_argument(1e-7, 1e-2), metavar="S", help=scale)
     centre = "the dish's centre [px] (default: the setup's, or found)"
     option("--centre", type=command.number_argument(0.0, 1e5), nargs=2, metavar=("U", "V"), help=centre)
     command.add_dish(parser)
-    bright = "greatest brightness of the needle, as a share of the floor's (default: the setup's)"
-    option("--needle-brightness", type=command.number_argument(0.1, 0.95), metavar="SHARE", help=bright)
-    tip = "a point near the needle's tip in the first frame that shows it, in the dish frame [m]"
-    option("--tip", type=command.number_argument(-0.25, 0.25), nargs=2, metavar=("X", "Y"), help=tip)
-    option("--json", type=command.output_file, metavar="FILE", help="write what was found to a file")
-    overlay = "draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
-    option("--overlay", type=Path, metavar="PATH", help=overlay)
+
+
+def chosen_view(options: argparse.Namespace) -> tuple[VisionTrackerSettings, Scene]:
+    """Return the settings and the scene that the options of `add_view` choose."""
+    given = read_scene(options.scene) if options.scene else None
+    if options.dish_diameter is not None:
+        given = Scene.create(dish_diameter=options.dish_diameter)
+    settings, scene = read_vision_setup(options.setup, given)
+    view = {
+        "metres_per_pixel": options.metres_per_pixel,
+        "dish_centre_px": tuple(options.centre or ()),
+        "region_px": tuple(options.region or ()),
+        "rim": options.rim,
+    }
+    chosen: dict[str, Any] = {name: value for name, value in view.items() if value}
+    return replace(settings, **chosen), scene
 
 
 def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Find needle and thread in camera frames, without a graph.
 
     FRAMES are pictures, a folder of them, a video, or a bag. Pictures that are named are searched one by one; the
-    frames of a bag, a video, or a folder of pictures of one size are followed over time, as the node vision_tracker
-    does.
+    frames of a bag, a video, or a folder are followed over time, as the node vision_tracker does. Those of a folder
+    are searched one by one too where sizes differ, or where, without --rate, a needle is mostly farther than its
+    length from where it was one picture before.
 
     --json writes a list with an entry for each frame: file (for a bag or video, with the stamp), status (tracked,
     lost or searching) and its reason, warning (of the dish's scale and tilt, and of the lens), axis_m (both ends of
@@ -77,30 +109,30 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     curvature_per_m (positive to the left), thread_m from the tail on, all in the dish frame, needle_length_m as
     measured over the first frames that follow one another, pieces of the thread (points_m, deviation_m across, why
     their ends are ends, arc_length_m of the first point at least and at most) and whether they are complete,
-    confidence from 0 to 1, stamp_s, and time_s, the processor time to search the frame, on one core, without reading
-    and decoding it; all is compiled before. What has no value is null.
+    confidence from 0 to 1, refused (what else is dark and slender where no needle is found, and which settings would
+    admit it), stamp_s, and time_s, the processor time to search the frame, on one core, without reading and decoding
+    it; all is compiled before. What has no value is null.
 
     Where no frame shows a needle the command fails.
     """
-    setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
-    view = {
-        "metres_per_pixel": options.metres_per_pixel,
-        "dish_centre_px": tuple(options.centre or ()),
-        "region_px": tuple(options.region or ()),
-        "rim": options.rim,
-        "max_needle_brightness": options.needle_brightness,
-    }
-    chosen: dict[str, Any] = {name: value for name, value in view.items() if value}
-    settings = replace(setup.vision, **chosen)
+    settings, scene = chosen_view(options)
+    length, width = options.needle or (None, None)
+    needle = {"needle_length": length, "needle_width": width, "max_needle_brightness": options.needle_brightness}
+    chosen: dict[str, Any] = {name: value for name, value in needle.items() if value}
+    settings = replace(settings, **chosen)
     source = open_frames(options, terminal.log)
-    if source.is_sequence and source.names:
-        how = f"read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
-        terminal.log(f"{options.frames[0]} is {how}")
-    tracker = VisionTracker(settings, setup.scene)
-    if options.tip is not None:
-        tracker.point_at_tip(np.array(options.tip))
     warm_up()
-    rows: list[dict[str, Any]] = []
+    if source.is_sequence and source.names:
+        how = f"is read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
+        first = [options.frames[0] / name for name in source.names[:10]]
+        if options.rate is None and not _is_film(VisionTracker(settings, scene), first, settings.needle_length):
+            how, source.is_sequence = "is no video, as its needle jumps: each is searched by itself", False
+        terminal.log(f"{options.frames[0]} {how}")
+    tracker = VisionTracker(settings, scene)
+    pointed = options.tip if options.tip_px is None else None  # in the dish frame, once that is known
+    if pointed is not None:
+        tracker.point_at_tip(np.array(pointed))
+    rows, refused = list[dict[str, Any]](), list[Refused]()
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
     files = numbered([Path(name).stem for name in source.names], "{}_{}")
     with (
@@ -109,21 +141,33 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     ):
         for index, frame in enumerate(source.frames):
             tracker.set_lens(frame.lens)
+            if pointed is None and options.tip_px and frame.image is not None:
+                seen = _look(tracker, frame, False)
+                if seen.view is not None:
+                    pointed = seen.place_of(np.array(options.tip_px))
+                    tracker.point_at_tip(pointed)
             began = time.thread_time()
             track = _look(tracker, frame, source.is_sequence)
+            took = time.thread_time() - began
+            others = _refused(frame, track, scene, settings)
+            refused += others
             unverified = {"unverified": source.unverified} if source.unverified else {}
-            rows.append({**_row(frame, track, time.thread_time() - began), **unverified})
+            rows.append({**_row(frame, track, took), "refused": [each.reason for each in others], **unverified})
             if writer is not None and frame.image is not None:
                 drawn = draw_overlay(frame.undistorted(), track, settings.needle_length, frame.name)
                 if track.view is not None:
-                    draw_dish(drawn, track.view.centre_px, setup.scene.dish.radius / track.view.metres_per_pixel)
+                    draw_dish(drawn, track.view.centre_px, scene.dish.radius / track.view.metres_per_pixel)
                 draw_region(drawn, settings.region_px)
+                draw_refused(drawn, others)
                 writer.write(files[index] if files else f"frame_{index:06d}", drawn)
             advance((index + 1) / max(source.count, 1))
     source.log_refused(terminal.log)
     terminal.print(_table(rows))
     for warning, count in Counter(row["warning"] for row in rows if row["warning"]).most_common():
         terminal.log(f"{warning}: {pluralize(count, 'frame')}")
+    for named, count in Counter(tuple(each.admitted_by) for each in refused).most_common(3):
+        example = next(each for each in refused if tuple(each.admitted_by) == named)
+        terminal.log(f"{pluralize(count, 'dark thing')} as this one: {example.reason}")
     if rows:
         counts = ", ".join(f"{n} {status}" for status, n in Counter(row["status"] for row in rows).most_common())
         median, high = np.percentile([1e3 * row["time_s"] for row in rows], (50, 95))
@@ -254,7 +298,7 @@ def open_frames(options: argparse.Namespace, log: Log) -> FrameSource:
         source.count, source.rate = len(files), lambda: rate
         source.names = names if len(set(names)) == len(names) else list(map(str, files))
         source.frames = (
-            source.read(name, partial(_read_picture, file), index / rate if is_folder else None, lens)
+            source.read(name, partial(_read_picture, file), index / rate if source.is_sequence else None, lens)
             for index, (name, file) in enumerate(zip(source.names, files, strict=True))
         )
     return source
@@ -309,8 +353,21 @@ def _of_one_size(files: list[Path]) -> bool:
     return len(sizes) < 2
 
 
+def _is_film(tracker: VisionTracker, pictures: list[Path], length: float) -> bool:
+    """Return whether a needle of a length [m] moves by less than that between most of the pictures that show it."""
+    places = list[np.ndarray | None]()
+    for file in pictures:
+        with suppress(OSError, BagError, InvalidInputError):  # reported when it is its turn
+            track = tracker.look(_read_picture(file))
+            places.append(None if track.reason else np.array([track.tail, track.tip]))
+    pairs = [(a, b) for a, b in itertools.pairwise(places) if a is not None and b is not None]
+    ways = [np.linalg.norm(b - a, axis=1).max() for a, b in pairs]
+    return not ways or float(np.median(ways)) < length
+
+
 def _read_picture(file: Path) -> np.ndarray:
-    return decode_image(read_regular(file, MAX_FILE_BYTES))
+    data = read_regular(file, MAX_FILE_BYTES)
+    return upright(decode_image(data), data)
 
 
 def _files_at(path: Path) -> list[Path]:
@@ -356,6 +413,13 @@ def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> Track:
         return tracker.look(frame.image)
     except InvalidInputError as error:
         return no_pose(State.LOST, str(error), None)
+
+
+def _refused(frame: FrameFile, track: Track, scene: Scene, settings: VisionTrackerSettings) -> list[Refused]:
+    """Return what was not taken for the needle in a frame in which there is none."""
+    if frame.image is None or track.view is None or not track.reason.startswith(NO_NEEDLE):
+        return []
+    return refused_needles(frame.undistorted(), track, scene, settings)
 
 
 def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:

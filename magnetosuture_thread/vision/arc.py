@@ -81,40 +81,13 @@ class Arc:
         angle = self.angle + self.curvature * along + math.atan2(slope, stretch)
         return Arc(self.at(along, aside), angle, self.curvature / stretch + bend)
 
+    def shifted(self, offset: np.ndarray | tuple[float, float]) -> Arc:
+        """Return the same arc in pixels that begin elsewhere."""
+        return replace(self, start=self.start + offset)
+
     def reversed_at(self, along: float) -> Arc:
         """Return the same arc, walked back from a length."""
         return Arc(self.at(along), self.angle + self.curvature * along + math.pi, -self.curvature)
-
-
-def fit_arc(points: np.ndarray) -> Arc:
-    """Fit a circle or a line to points; the arc starts at its point nearest to their mean.
-
-    Minimises sum (A z + B x + C y + D)^2 over sum of its squared gradients, z = x^2 + y^2, by a singular
-    value decomposition, in which a line is the case A = 0.
-
-    Args:
-        points: shape (m, 2), m >= 3 [px].
-
-    Source: [Taubin1991] G. Taubin, "Estimation of planar curves, surfaces, and nonplanar space curves defined by
-    implicit equations", IEEE T-PAMI 13(11). Deviation: none.
-    """
-    mean = points.mean(axis=0)
-    x, y = (points - mean).T
-    z = x * x + y * y
-    spread = max(float(z.mean()), 1e-12)
-    scaled = np.stack([(z - spread) / (2.0 * math.sqrt(spread)), x, y])
-    a, b, c = np.linalg.eigh(scaled @ scaled.T)[1][:, 0]
-    a /= 2.0 * math.sqrt(spread)
-    d = -spread * a
-    a, b, c, d = (float(value) for value in np.array([a, b, c, d]) / math.sqrt(max(b * b + c * c - 4.0 * a * d, 1e-24)))
-    gradient = math.hypot(b, c)
-    if gradient < 1e-9:  # The mean is the centre: any point is as near as another.
-        b, c, gradient = 1.0, 0.0, 1.0
-    normal = np.array([b, c]) / gradient
-    # Along the normal through the mean: a t^2 + gradient t + d = 0, the root of smaller size.
-    foot = -2.0 * d / (gradient + math.sqrt(max(gradient * gradient - 4.0 * a * d, 0.0)))
-    # Across the tangent (n_v, -n_u) lies the normal itself, and the circle's centre lies against it where a > 0.
-    return Arc(mean + foot * normal, math.atan2(-normal[0], normal[1]), -2.0 * a)
 
 
 @dataclass(frozen=True)
@@ -132,6 +105,8 @@ class MeasuredNeedle:
         size_measured: whether the length was measured, and not only known before.
         tail_shift_px: how far along the axis the tail's edge lies from where the tail is drawn [px]; see `tail_shift`.
         direction_is_clear: whether the needle fits much worse the other way round.
+        told_by_line: whether nothing but a line that leaves one end tells which is the tail: a thread, or a mark on
+            the floor.
     """
 
     arc: Arc
@@ -144,10 +119,11 @@ class MeasuredNeedle:
     size_measured: bool = False
     tail_shift_px: float = 0.0
     direction_is_clear: bool = True
+    told_by_line: bool = False
 
     def shifted(self, offset: np.ndarray | tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""
-        return replace(self, arc=replace(self.arc, start=self.arc.start + offset))
+        return replace(self, arc=self.arc.shifted(offset))
 
     def reversed(self) -> MeasuredNeedle:
         """Return the needle the other way round: its tip is where its tail was.
@@ -164,6 +140,15 @@ class MeasuredNeedle:
             covariance = turn @ covariance @ turn.T + np.diag([REVERSED_PX**2, 0.0, 0.0])
         arc = self.arc.reversed_at(self.length_px)
         return replace(self, arc=arc, covariance=covariance, size_measured=False, tail_shift_px=0.0)
+
+    def undirected(self) -> MeasuredNeedle:
+        """Return the needle, its tail perhaps where its tip is taken to be."""
+        chord, ahead = self.tip_px - self.tail_px, self.direction_px
+        tip = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
+        assert self.covariance is not None
+        covariance = self.covariance + np.outer(tip, tip) + np.diag([0.0, 0.0, math.pi**2])
+        confidence = 0.5 * self.confidence
+        return replace(self, covariance=covariance, confidence=confidence, heading_known=False, tail_shift_px=0.0)
 
     def pointing(self, toward: np.ndarray) -> MeasuredNeedle:
         """Return the needle the way round that a direction is nearer to, shape (2,)."""
@@ -204,19 +189,23 @@ class NeedleSize:
         width_px: of its body [px].
         tolerance: share of the length by which it may be off, two standard deviations; 0: it is known.
         max_brightness: greatest brightness of a pixel that may be the needle's, as a share of the floor's.
+        is_blunt: whether both ends are known to be blunt, so that no shape tells the tip.
+        max_bend: angle that it turns by from end to end, at most [rad].
     """
 
     length_px: float
     width_px: float
     tolerance: float = 0.0
     max_brightness: float = 0.55
+    is_blunt: bool = False
+    max_bend: float = 4.0
 
 
 class LengthEstimator:
     """Measures the needle's length over the first frames, and keeps it from then on.
 
-    It is the median of the last `FRAMES` lengths of confident poses that show both ends, once all of them lie within
-    `AGREEMENT` of each other.
+    It is the median of `FRAMES` lengths of confident poses that show both ends, of the last twice as many, once these
+    lie within `AGREEMENT` of each other.
 
     Attributes:
         length: measured [m]; None until then.
@@ -230,10 +219,12 @@ class LengthEstimator:
         """Take the length of a needle whose ends a frame shows [m], and the confidence of its pose."""
         if self.length is not None or confidence < 0.3:
             return
-        self._lengths = [*self._lengths[1 - FRAMES :], length]
-        middle = float(np.median(self._lengths))
-        if len(self._lengths) == FRAMES and np.ptp(self._lengths) < AGREEMENT * middle:
-            self.length = middle
+        self._lengths = [*self._lengths[1 - 2 * FRAMES :], length]
+        ordered = np.sort(self._lengths)
+        for first in range(len(ordered) - FRAMES + 1):
+            alike = ordered[first : first + FRAMES]
+            if np.ptp(alike) < AGREEMENT * np.median(alike):
+                self.length = float(np.median(alike))
 
     def size(self, length: float, width: float, metres_per_pixel: float) -> NeedleSize:
         """Return the size in an image of a needle whose length and width are set [m], by the image's scale [m]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -38,7 +38,9 @@ class Calibration:
         scatter_px: root of the mean square by which the frames differ from one another [px].
         dish_diameter: inner diameter of the dish [m].
         homography: from a tilted camera's frame to the one in which the view holds, shape (3, 3); None if straight.
-        needle_length: measured [m]; None if it was not asked for. See `measure_needle_length`.
+        needle: length and width [m], its length measured; None if it was not asked for. See `measure_needle_length`.
+        looked: settings of the tracker that it was looked for with: part of the frame, edge of the wall, and how the
+            needle looks.
         scale_error: standard deviation of the scale by the dish, as a share.
         remark: what a user should know of the view; empty if nothing.
     """
@@ -49,23 +51,37 @@ class Calibration:
     scatter_px: float
     dish_diameter: float
     homography: np.ndarray | None = None
-    needle_length: float | None = None
+    needle: tuple[float, float] | None = None
+    looked: VisionTrackerSettings = field(default_factory=VisionTrackerSettings)
     scale_error: float = 0.0
     remark: str = ""
 
     def to_yaml(self) -> str:
-        """Return a section of a ROS 2 parameter file for the vision tracker, and the needle's length for every node."""
+        """Return a section of a ROS 2 parameter file for the vision tracker, and the needle's size for every node."""
         values: dict[str, Any] = {
             "dish_centre_px": [round(float(value), 3) for value in self.view.centre_px],
             "metres_per_pixel": float(f"{self.view.metres_per_pixel:.7g}"),
             "scale_error": round(float(self.scale_error), 4),
             "camera_rotation": round(float(self.view.rotation), 6),
         }
+        usual = VisionTrackerSettings()
+        for name in (
+            "region_px",
+            "rim",
+            "max_needle_brightness",
+            "needle_colour",
+            "needle_is_blunt",
+            "max_needle_bend",
+        ):
+            value = getattr(self.looked, name)
+            if value != getattr(usual, name):
+                values[name] = [round(each, 4) for each in value] if isinstance(value, tuple) else value
         if self.homography is not None:
             values["straightening"] = [float(f"{value:.12g}") for value in self.homography.ravel()]
         sections = {}
-        if self.needle_length is not None:
-            sections[EVERY_NODE] = {"ros__parameters": {"needle_length": round(self.needle_length, 6)}}
+        if self.needle is not None:
+            sizes = zip(("needle_length", "needle_width"), self.needle, strict=True)
+            sections[EVERY_NODE] = {"ros__parameters": {name: round(size, 6) for name, size in sizes}}
         sections[f"{EVERY_NODE}/{VisionTrackerSettings.GROUP}"] = {"ros__parameters": values}
         return yaml.safe_dump(sections, sort_keys=False)
 
@@ -82,7 +98,8 @@ def measure_needle_length(images: Sequence[np.ndarray], calibration: Calibration
     Raises:
         InvalidInputError: too few images show a needle of about that length, or they do not agree on one.
     """
-    settings = VisionTrackerSettings(
+    settings = replace(
+        calibration.looked,
         needle_length=length,
         needle_width=width,
         dish_centre_px=calibration.view.centre_px,
@@ -148,6 +165,7 @@ def calibrate_by_dish(
         scatter,
         dish_diameter,
         None if straight is None else scaled_homography(scaled_homography(straight, 1.0, -left, -top), 1.0 / factor),
+        looked=given,
         scale_error=nearest.scale_error,
         remark="; ".join(filter(None, (nearest.warning, elsewhere))),
     )

@@ -1,8 +1,9 @@
 """Finds the petri dish, how far the camera over it is tilted, and whether it moves.
 
-The dish is a bright disc within a dark rim; without one, as in a photograph, an ellipse that the edges of its wall
-agree on, whatever is brighter. A wall and a lid have several edges, its rings: by how much they differ is the doubt of
-the scale, and a tilt is one that two of them agree on.
+Candidates are the rings of a dish, the edges of its wall and its lid: ellipses that edges of the image agree on in most
+directions. A wall as dark as steel, on both sides of which the ground is seen, tells the inner edge to 0.1 %. Of any
+other the innermost ring is taken, and by how much the others differ from it is the doubt of the scale. A tilt is one
+that two rings agree on.
 """
 
 from __future__ import annotations
@@ -16,41 +17,42 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, shrunk
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSettings
 
-COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for
+COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
 MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
 CELL = 2.0  # px; of votes
 RING = 1.03  # ratio of radii of a ring
 BINS = 72  # directions
 ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
 AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
-MIN_RATIO = 0.8  # of the axes: a camera tilted by 37 degrees
-INNER_RADIUS = 0.82  # of one ring of a wall, that another one has at least
-MAX_RINGS = 5  # edges of wall and lid
-NORMALS, FINE_REACH = 180, 0.03  # along which the edge is measured; how far, of the radius
+MIN_RATIO = 0.7  # of the axes: a camera tilted by 45 degrees
+RANGE = 0.21  # of a ring's radius, within which others of its wall and lid are: a lid is up to 18 % larger
+PARALLAX = 0.08  # of the radius, that a lid's ring is shifted by: 15 mm above the floor of 90 mm, tilted by 13 degrees
+MAX_RINGS = 10  # edges of wall and lid
+SUPPORT = 0.6  # share of the directions in which a ring must be seen
 
-RAYS, RIM_RAYS = 180, 72  # along which the rim is looked for, and of the quick check
-SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
-REACH = 0.04  # of the radius, in which the rim is looked for once it is known
+RAYS = 180  # along which rings and a wall are measured
 AGREEMENT_PX = 2.0
-EDGE_LEVEL = 60  # of the circle transform, as of Canny's upper threshold; the lower one is half of it
-MIN_CONTRAST = 12.0  # grey levels; of the rim at least, and 0.15 of the floor's brightness
+MIN_CONTRAST = 12.0  # grey levels; of the wall at least, and 0.15 of the floor's brightness
+WALL = 0.0025  # m; breadth of a wall and its shadow at most; the two edges of a moulded one are half as far apart
 
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
 TILT_ERROR = math.radians(2.0)  # of a ring's tilt, by light and noise
+CUT_TILT = math.radians(10.0)  # that a dish of which a part is seen does not tell
 NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most; more is hardly used over a dish
 
 DARK_FLOOR = 130.0  # grey levels; a dish, or with a given view a frame, whose median is below may have a dark floor
-SCALE_ERROR = 0.001  # of a scale by a dark rim: how far its light moves the edge
-RING_ERROR = 0.01  # of a radius and a centre by a ring of any other look
-GIVEN_ERROR = 0.03  # of a given scale against the dish's diameter, that light and tolerances of a mould may make
-WALL = 0.001  # m; thickness of a moulded dish's wall, of which one edge that is seen alone may be either
-LONG_SEARCH = 4  # frames without a dish, in one of which it is looked for as in a photograph
+SCALE_ERROR = 0.001  # of a scale by a dark wall: how far its light moves the edge
+RING_ERROR = 0.01  # of a radius and a centre by a ring of any other look; with the tolerances of a mould three times it
 
 NO_DISH = "no dish in the image: show its whole rim in even light, limit the search by region_px, or give its view"
 
-Circle = tuple[float, float, float, int]  # u, v and radius [px], and how many points agree
+
+def unit_vectors(count: int) -> Points:
+    """Return unit vectors in directions all around, shape (count, 2)."""
+    turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return np.column_stack([np.cos(turns), np.sin(turns)])
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,7 @@ class Ellipse:
 
     def points(self, count: int) -> tuple[Points, Points]:
         """Return points of the ellipse and its outward normals, both of shape (count, 2)."""
-        turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-        circle = np.column_stack([np.cos(turns), np.sin(turns)])
+        circle = unit_vectors(count)
         normals = circle * (self.major, self.minor) @ self.axes
         return self.at(circle), normals / np.hypot(*normals.T)[:, None]
 
@@ -89,11 +90,6 @@ class Ellipse:
     def at(self, coordinates: Points) -> Points:
         """Return the points of coordinates, the inverse of `coordinates` [px]."""
         return np.asarray(coordinates * (self.minor, self.major) @ self.axes + self.centre_px)
-
-    def is_cut(self, shape: tuple[int, ...]) -> bool:
-        """Say whether a part of it lies outside of an image of a shape (rows, columns)."""
-        points, _ = self.points(60)
-        return not ((points > 0.0) & (points < np.array(shape[1::-1]) - 1.0)).all()
 
     def scaled(self, factor: float) -> Ellipse:
         """Return the ellipse in an image enlarged by a factor."""
@@ -110,13 +106,6 @@ class _Edges:
     normals: Points
     shape: tuple[int, ...]
 
-    def radii(self, ellipse: Ellipse) -> tuple[Points, np.ndarray]:
-        """Return the edges' coordinates in an ellipse, and which of their gradients lie along its normals."""
-        at = ellipse.coordinates(self.points)
-        normal = at / (ellipse.minor, ellipse.major)
-        along = (normal * (self.normals @ ellipse.axes.T)).sum(axis=1)
-        return at, np.abs(along) > ALIGNMENT * np.hypot(*normal.T)
-
 
 @dataclass(frozen=True)
 class Ring:
@@ -126,87 +115,149 @@ class Ring:
     support: float
 
 
-def find_rings(image: np.ndarray, known: Ellipse | None = None) -> list[Ring]:
-    """Find the edges of a dish's wall by gradients alone, the best supported one first.
+def find_rings(image: np.ndarray) -> list[Ring]:
+    """Find the edges of a dish's wall and lid by gradients alone.
 
     In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
     is stretched in a few directions, in which the ellipse of a tilted camera is nearly a circle. Around the centres
     with the most votes, random samples of five edges give ellipses, and the one is kept that edges in the most
-    directions agree on, within a share of its radius; then others near it. In the full image each edge is measured
-    along its normals.
+    directions agree on, within a share of its radius. Around it the image itself is searched for all rings.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3), uint8.
-        known: an edge that was found before, which comes first [px].
     """
     factor = max(1.0, min(image.shape[:2]) / COARSE_SIDE)
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
     if max(size) > 4 * COARSE_SIDE:  # no frame of a camera
         return []
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1.0 else image
-    factor = image.shape[1] / small.shape[1]
     edges = _edges_of(small)
-    if len(edges.points) < 40:
-        return []
-    if known is not None:
-        others = _rings_near(edges, Ring(known.scaled(1.0 / factor), 1.0))
-        return [Ring(known, 1.0), *_refined(image, others, factor)]
     found = _candidates(edges, 1.0, 0.0)
-    if not found or max(share for _, share, _ in found) < 0.8:
-        found += [each for way in range(4) for each in _candidates(edges, 1.0 / 0.9, 0.25 * math.pi * way)]
+    for way in range(4):
+        if found and max(share for _, share, _ in found) >= 0.8:
+            break
+        found += _candidates(edges, 1.0 / 0.9, 0.25 * math.pi * way)
     if not found:
         return []
-    _, share, ellipse = max(found, key=lambda each: each[0])
-    best = Ring(ellipse, share)
-    return _refined(image, [best, *_rings_near(edges, best)], factor)
+    at = max(found, key=lambda each: each[0])[2].scaled(image.shape[1] / small.shape[1])
+    factor = max(1, round(min(image.shape[:2]) / (6 * COARSE_SIDE)))
+    gray, first = shrunk(measured_channel(image), factor), at.scaled(1.0 / factor)
+    radius = 0.5 * (first.major + first.minor)  # It may lie across several, and look tilted by that.
+    sets = [_rings_around(gray, each) for each in (first, replace(first, major=radius, minor=radius))]
+    sets += [_rings_around(gray, max(each, key=lambda ring: ring.support).ellipse) for each in sets if each]
+    # Strong rings speak for an ellipse; weak ones are there by chance.
+    rings = max(sets, key=lambda each: sum(ring.support**4 for ring in each))
+    return [replace(ring, ellipse=ring.ellipse.scaled(float(factor))) for ring in rings]
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Where the light changes along directions from a centre.
+
+    Attributes:
+        at: the ellipse in whose axes they are told.
+        radius: of each, in these axes, shape (m,).
+        way: index of its direction, of `RAYS`, shape (m,).
+        rises: whether it is brighter beyond, shape (m,).
+    """
+
+    at: Ellipse
+    radius: np.ndarray
+    way: np.ndarray
+    rises: np.ndarray
+
+    @staticmethod
+    def around(gray: Gray, at: Ellipse) -> _Steps:
+        """Find them as far as `RANGE` from an ellipse [px]."""
+        step = max(1.0 / at.minor, 0.5 * FINE_AGREEMENT)
+        radii = np.arange(1.0 - RANGE, 1.0 + RANGE, step)
+        places = at.at(radii[:, None, None] * unit_vectors(RAYS))
+        light = sampled(gray, places).astype(np.float32)
+        light = cv2.GaussianBlur(np.hstack([light[:, -3:], light, light[:, :3]]), (0, 0), 1.0)[:, 3:-3]
+        change = light[2:] - light[:-2]
+        slopes = np.abs(change)
+        slopes[~_within(places[2:], gray.shape) | ~_within(places[:-2], gray.shape)] = 0.0
+        before, top, after = slopes[:-2], slopes[1:-1], slopes[2:]
+        texture = middle(slopes[slopes > 0.0]) if slopes.any() else 0.0
+        row, way = np.nonzero((top >= before) & (top > after) & (top > max(1.0, 3.0 * texture)))
+        before, top, after = before[row, way], top[row, way], after[row, way]
+        radius = radii[row + 2] + 0.5 * step * (before - after) / (before - 2.0 * top + after)
+        return _Steps(at, radius, way, change[row + 1, way] > 0.0)
+
+    def points(self) -> Points:
+        """Return their places, shape (m, 2) [px]."""
+        return self.at.at(self.radius[:, None] * unit_vectors(RAYS)[self.way])
+
+    def most_agreed(self, left: np.ndarray) -> tuple[Ellipse, np.ndarray, int]:
+        """Return the ring that most of those left agree on, roughly, those within `AGREEMENT` of it, and their number.
+
+            r = r_0 + a cos t + b sin t
+
+        for r_0 in cells of `FINE_AGREEMENT`, and all shifts (a, b) up to `PARALLAX`. Rings that are next to each other
+        rise and fall in turn: those that do the one and the other are not counted together.
+        """
+        shift, ways = np.linspace(-PARALLAX, PARALLAX, 11), unit_vectors(RAYS)[self.way]
+        shifts = np.stack(np.meshgrid(shift, shift), axis=-1).reshape(-1, 2)
+        count = int(2.0 * RANGE / FINE_AGREEMENT) + 1
+        cells = np.floor((self.radius[left] - shifts @ ways[left].T - 1.0 + RANGE) / FINE_AGREEMENT).astype(int)
+        inside = (cells >= 0) & (cells < count)
+        cells += count * (np.arange(len(shifts))[:, None] + len(shifts) * self.rises[left])
+        votes = np.bincount(cells[inside], minlength=2 * count * len(shifts)).reshape(2, -1, count)
+        votes = votes[..., :-2] + votes[..., 1:-1] + votes[..., 2:]
+        rises, best, cell = np.unravel_index(int(votes.argmax()), votes.shape)
+        radius = 1.0 - RANGE + FINE_AGREEMENT * (cell + 1.5)
+        u, v = self.at.at(shifts[best])
+        ring = replace(self.at, centre_px=(u, v), major=self.at.major * radius, minor=self.at.minor * radius)
+        apart = np.abs(self.radius - ways @ shifts[best] - radius)
+        return ring, left & (self.rises == rises) & (apart < AGREEMENT), int(votes[rises, best, cell])
+
+
+def _within(points: Points, shape: tuple[int, ...]) -> np.ndarray:
+    """Say which points, of shape (..., 2), lie in an image of a shape (rows, columns), shape (...)."""
+    return np.asarray(((points >= 1.0) & (points <= np.array(shape[1::-1]) - 2.0)).all(axis=-1))
+
+
+def _rings_around(gray: Gray, at: Ellipse) -> list[Ring]:
+    """Find the edges of wall and lid near an ellipse.
+
+    They are circles one above the other: in units of the ellipse's axes each is nearly a circle, shifted by what the
+    camera sees of its height. The one that most changes of the light agree on is fitted by an ellipse and taken out,
+    then the next.
+    """
+    steps = _Steps.around(gray, at)
+    points, left, found = steps.points(), np.ones(len(steps.way), np.bool_), list[Ring]()
+    for _ in range(MAX_RINGS):
+        begin, own, votes = steps.most_agreed(left)
+        left &= ~own
+        if votes < 0.2 * RAYS:  # of a dish that is cut off
+            break
+        ellipse = fitted_robustly(points[own], begin)
+        if ellipse is None:
+            continue
+        apart = np.abs(np.hypot(*ellipse.coordinates(points).T) - 1.0)
+        left &= apart > max(AGREEMENT, 2.0 / ellipse.major)
+        agree = np.unique(steps.way[apart < max(FINE_AGREEMENT, 1.0 / ellipse.major)])
+        outline = _within(ellipse.points(RAYS)[0], gray.shape)
+        support = min(1.0, len(agree) / max(1, int(outline.sum())))
+        if support >= SUPPORT + 0.5 * (1.0 - float(outline.mean())):
+            found.append(Ring(ellipse, support))
+    return found
 
 
 def inner_ring(rings: list[Ring], *, outer: bool = False) -> Ellipse:
-    """Return the smallest of the rings that are about as well supported as the best, or the largest of them."""
-    best = max(ring.support for ring in rings)
-    ellipses = [ring.ellipse for ring in rings if ring.support >= 0.85 * best]
-    return (max if outer else min)(ellipses, key=lambda each: each.major)
-
-
-def edge_along(gray: Gray, at: Ellipse, reach: float = FINE_REACH) -> Points:
-    """Return where an image changes most along the normals of an ellipse, in the stronger sign, shape (m, 2).
-
-    Args:
-        gray: shape (rows, columns), uint8.
-        at: the ellipse [px].
-        reach: how far to look to both sides of it, as a share of its radius.
-    """
-    step, half = 0.5, int(2.0 * max(4.0, reach * at.major))
-    points, normals = at.points(NORMALS)
-    offsets = step * np.arange(-half, half + 1)
-    profiles = sampled(gray, points[:, None] + offsets[:, None] * normals[:, None])
-    # Slope of a line through five samples.
-    slopes = (2.0 * (profiles[:, 4:] - profiles[:, :-4]) + profiles[:, 3:-1] - profiles[:, 1:-3]) / (10.0 * step)
-    inside = ((points >= 1.0) & (points <= np.array(gray.shape[::-1]) - 2.0)).all(axis=1)
-    rows, steepest = np.arange(NORMALS), np.abs(slopes).argmax(axis=1)
-    strongest = np.where(inside, slopes[rows, steepest], 0.0)
-    sign = 1.0 if np.sum(np.sign(strongest) * np.sqrt(np.abs(strongest))) > 0.0 else -1.0
-    slopes = sign * slopes
-    steepest = slopes.argmax(axis=1)
-    kept = inside & (steepest > 0) & (steepest < slopes.shape[1] - 1)
-    kept &= slopes[rows, steepest] > 0.5  # grey levels a pixel
-    rows, steepest = rows[kept], steepest[kept]
-    before, top, after = (np.abs(slopes[rows, steepest + shift]) for shift in (-1, 0, 1))
-    bend = before - 2.0 * top + after
-    part = np.where(bend < 0.0, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
-    return np.asarray(points[rows] + (offsets[steepest + 2] + step * part)[:, None] * normals[rows])
+    """Return the smallest of the rings, or the largest of them."""
+    return (max if outer else min)((ring.ellipse for ring in rings), key=lambda each: each.major)
 
 
 def fitted_robustly(points: Points, begin: Ellipse) -> Ellipse | None:
     """Return the ellipse that most points agree on, near a first one; None if few do."""
     kept, at = points, begin
     for tolerance in (4.0 * FINE_AGREEMENT, 2.0 * FINE_AGREEMENT, FINE_AGREEMENT):
-        fitted = _fitted(kept)
-        if fitted is None:
+        if (fitted := _fitted(kept)) is None:
             return None
         at = fitted
         kept = points[np.abs(np.hypot(*at.coordinates(points).T) - 1.0) < max(tolerance, 1.0 / at.major)]
-        if len(kept) < NORMALS // 4:
+        if len(kept) < RAYS // 4:
             return None
     if math.dist(at.centre_px, begin.centre_px) > 0.05 * begin.major or abs(at.major / begin.major - 1.0) > 0.08:
         return None
@@ -240,7 +291,12 @@ def _candidates(edges: _Edges, ratio: float, direction: float) -> list[tuple[flo
     back = np.linalg.inv(stretch)
     normals = edges.normals @ back
     moved = _Edges(edges.points @ stretch, normals / np.hypot(*normals.T)[:, None], edges.shape)
-    return [each for centre in _centres(moved, ratio) for each in _around(edges, moved, centre, back)]
+    found = list[tuple[float, float, Ellipse]]()
+    for centre in _centres(moved, ratio):
+        found += _around(edges, moved, centre, back)
+        if found and found[-1][1] > 0.95:
+            break
+    return found
 
 
 def _centres(edges: _Edges, ratio: float) -> list[Points]:
@@ -301,7 +357,7 @@ def _around(edges: _Edges, moved: _Edges, centre: Points, back: np.ndarray) -> l
         if ellipse is None:
             continue
         share, seen = _support(edges, ellipse)
-        if seen >= 0.5 and share >= _needed(seen):
+        if seen >= 0.5 and share >= SUPPORT + 0.5 * (1.0 - seen):  # Of a short arc chance is more.
             score = share * math.sqrt(seen) * (ellipse.major / min(edges.shape)) ** 0.25
             found.append((score, share, ellipse))
     return found
@@ -314,44 +370,14 @@ def _sectors(offsets: Points) -> np.ndarray:
 
 def _support(edges: _Edges, ellipse: Ellipse) -> tuple[float, float]:
     """Return in which share of the directions in the frame edges agree with an ellipse, and the share in the frame."""
-    points, _ = ellipse.points(BINS)
-    inside = ((points > 1.0) & (points < np.array(edges.shape[::-1]) - 2.0)).all(axis=1)
-    if not inside.any():
-        return 0.0, 0.0
-    at, facing = edges.radii(ellipse)
+    inside = _within(ellipse.points(BINS)[0], edges.shape)
+    at = ellipse.coordinates(edges.points)
+    normal = at / (ellipse.minor, ellipse.major)
+    facing = np.abs((normal * (edges.normals @ ellipse.axes.T)).sum(axis=1)) > ALIGNMENT * np.hypot(*normal.T)
     agree = facing & (np.abs(np.hypot(*at.T) - 1.0) < max(0.8 / ellipse.major, AGREEMENT))
     marks = np.zeros(BINS, bool)
     marks[_sectors(at[agree])] = True
-    return float((marks & inside).sum() / inside.sum()), float(inside.mean())
-
-
-def _needed(seen: float) -> float:
-    """Return the support that an ellipse needs of which a share lies in the frame: of a short arc chance is more."""
-    return 0.6 + 0.5 * (1.0 - seen)
-
-
-def _rings_near(edges: _Edges, best: Ring) -> list[Ring]:
-    """Return other edges of a wall or a lid than the best supported one, about as large as it.
-
-    Wall and lid are at different heights: seen by a tilted camera their edges are not concentric.
-    """
-    at, near = edges.radii(best.ellipse)
-    away = np.hypot(*at.T)
-    near &= (away > INNER_RADIUS) & (away < 2.0 - INNER_RADIUS)
-    found = [best]
-    while len(found) < MAX_RINGS:
-        last = found[-1].ellipse
-        own = np.abs(np.hypot(*edges.radii(last)[0].T) - 1.0) < max(1.5 * AGREEMENT, 2.0 / last.major)
-        near &= ~own
-        points = _through(at[near], max(0.8 / best.ellipse.major, AGREEMENT))
-        ellipse = _fitted(best.ellipse.at(points)) if points is not None else None
-        if ellipse is None:
-            break
-        share, seen = _support(edges, ellipse)
-        if share < _needed(seen):
-            break
-        found.append(Ring(ellipse, share))
-    return found[1:]
+    return float((marks & inside).sum() / max(1, inside.sum())), float(inside.mean())
 
 
 def _through(offsets: Points, tolerance: float) -> Points | None:
@@ -388,7 +414,7 @@ def _through(offsets: Points, tolerance: float) -> Points | None:
     marks[sample, sectors[edge]] = True
     turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
     best = _harmonics(turns) @ shapes[marks.sum(axis=1).argmax()]
-    return np.asarray(best[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]))
+    return np.asarray(best[:, None] * unit_vectors(BINS))
 
 
 def _harmonics(turns: np.ndarray) -> np.ndarray:
@@ -396,23 +422,6 @@ def _harmonics(turns: np.ndarray) -> np.ndarray:
     return np.column_stack(
         [np.ones_like(turns), np.cos(turns), np.sin(turns), np.cos(2.0 * turns), np.sin(2.0 * turns)]
     )
-
-
-def _refined(image: np.ndarray, rings: list[Ring], scale: float) -> list[Ring]:
-    """Return rings of an image shrunk by a scale, measured along their normals in the image's own pixels."""
-    gray = measured_channel(image)
-    factor = max(1, round(min(gray.shape) / 960))  # rows or columns are enough to measure in
-    gray, result = shrunk(gray, factor), []
-    for ring in rings:
-        at = ring.ellipse.scaled(scale / factor)
-        for reach in (FINE_REACH, 0.5 * FINE_REACH):
-            fitted = fitted_robustly(edge_along(gray, at, reach), at)
-            if fitted is None:
-                break
-            at = fitted
-        if at.minor > MIN_RATIO * at.major:
-            result.append(Ring(at.scaled(float(factor)), ring.support))
-    return result
 
 
 def _fitted(points: Points) -> Ellipse | None:
@@ -543,91 +552,117 @@ class FoundDish:
         return np.asarray(cv2.warpPerspective(image, homography, size, borderMode=cv2.BORDER_REPLICATE))
 
 
-def see_dish(
-    image: np.ndarray, settings: VisionTrackerSettings, diameter: float, *, photographed: bool = True
-) -> FoundDish | None:
+def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> FoundDish | None:
     """Find the view: what of it is given, and the rest by the dish; None if none is seen.
 
     Args:
         image: frame, shape (rows, columns) or (rows, columns, 3), uint8.
         settings: what to look for.
         diameter: of the dish [m].
-        photographed: whether to look for a dish as in a photograph where there is no other, which takes long.
     """
-    gray = measured_channel(image)
-    fixed = settings.fixed_view()
+    gray, fixed = measured_channel(image), settings.fixed_view()
     if fixed is not None:
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
-        dark = middle(gray[::8, ::8]) < DARK_FLOOR and not _fits(find_dish(gray, diameter), fixed)
-        dark = dark and _fits(find_dish(255 - gray, diameter), fixed)
-        error = settings.scale_error
+        radius, error = 0.5 * diameter / fixed.metres_per_pixel, settings.scale_error
+        if 2.0 * radius < MIN_SIDE_PX:
+            return None
+        ring = Ring(Ellipse(fixed.centre_px, radius, radius, 0.0), 1.0)
+        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _by_wall(gray, [ring], settings, diameter, True) is not None
         return FoundDish(fixed, dark, None, error, remark=_scale_remark(error), homography=settings.homography())
-    for dark_field in (False, True):
-        if dark_field:
-            gray = 255 - gray
-        view = find_dish(gray, diameter)
-        if view is None or (dark_field and floor_level(gray, view, diameter) < 255.0 - DARK_FLOOR):
-            continue  # A bright rim around a bright floor, as of clear walls.
-        radius = 0.5 * diameter / view.metres_per_pixel
-        circle = Ellipse(view.centre_px, radius, radius, 0.0)
-        rings = find_rings(image, circle)
-        edge = inner_ring(rings, outer=settings.rim == "outer") if settings.rim and rings else circle
-        if edge is circle:
-            found = _by_dark_rim(gray, view, rings, settings, diameter)
-        else:
-            found = _by_ring(edge, rings, settings, diameter)
-        given = _with_given(replace(found, dark_field=dark_field), settings)
-        if given is not None:
-            return given
-    return _photographed(image, settings, diameter) if photographed else None
+    rings = find_rings(image)
+    if not rings:
+        return None
+    if settings.rim != "outer":
+        for dark_field in (False, True):
+            found = _by_wall(gray, rings, settings, diameter, dark_field)
+            if found is not None:
+                return _with_given(found, settings)
+    return _with_given(_by_ring(gray, rings, settings, diameter), settings)
 
 
-def _fits(found: DishView | None, given: DishView) -> bool:
-    return found is not None and abs(found.metres_per_pixel / given.metres_per_pixel - 1.0) < 1.0 - INNER_RADIUS
+def _by_wall(
+    gray: Gray, rings: list[Ring], settings: VisionTrackerSettings, diameter: float, dark_field: bool
+) -> FoundDish | None:
+    """Return the dish by a wall as dark as steel, of a dark floor as bright; None unless both of its sides are seen.
+
+    The wall's inner edge gives the radius, and its darkest ring, which light from one side does not shift, the centre
+    and the tilt. All other rings lie at the wall, and beyond it the ground is bright again: a clear dish on a dark
+    bench looks the same from the inside.
+    """
+    light, guess = (255 - gray if dark_field else gray), inner_ring(rings)
+    centre, radius = guess.centre_px, 0.5 * (guess.major + guess.minor)
+    edges, darkest, count = np.empty((0, 2)), np.empty((0, 2)), 0
+    for reach, step in ((0.12, 1.0), (0.04, 0.5)):  # in shares of the radius: by a first guess, and once it is known
+        edges, darkest = rim_points(light, centre, radius, reach * radius, step, RAYS)
+        circle = fit_circle(edges, AGREEMENT_PX)
+        if circle is None:
+            return None
+        centre, radius, count = circle[:2], circle[2], circle[3]
+    inner, ring = Ellipse(centre, radius, radius, 0.0), fit_circle(darkest, 0.5 * AGREEMENT_PX)
+    seen, (oval, spread) = _within(inner.points(RAYS)[0], gray.shape), _oval_of(darkest, inner)
+    needed = SUPPORT * seen.sum()
+    shares, farthest = [each.ellipse.major / radius for each in rings], 1.0 + 2.0 * WALL / diameter
+    beyond = Ellipse(centre, farthest * radius, farthest * radius, 0.0).points(RAYS)[0]
+    beyond = beyond[_within(beyond, gray.shape)]
+    if max(count, len(spread)) < needed or seen.mean() < 0.4 or not len(darkest) or not len(beyond):
+        return None
+    view = DishView(centre, 0.5 * diameter / radius)
+    floor, wall, ground = floor_level(gray, view, diameter), *(middle(sampled(gray, at)) for at in (darkest, beyond))
+    higher = wall - ground if dark_field else ground - wall
+    is_dark = min(floor, wall) < settings.max_needle_brightness * max(floor, wall)
+    is_alone = min(shares) > 1.0 - 2.0 * AGREEMENT and max(shares) < farthest
+    if not (is_dark and is_alone and higher > max(MIN_CONTRAST, 0.15 * max(floor, wall))):
+        return None
+    error = RING_ERROR if len(spread) < needed else SCALE_ERROR
+    if ring is not None and ring[3] >= needed:
+        view, error = replace(view, centre_px=ring[:2]), SCALE_ERROR
+    if ring is not None and seen.mean() < 0.9:
+        # By an edge that light shifts, a part of a circle tells its centre and its radius apart badly.
+        scale = 0.5 * diameter / middle(np.hypot(*(edges - ring[:2]).T))
+        return FoundDish(replace(view, metres_per_pixel=scale), dark_field, None, error, CUT_TILT)
+    tilt, unseen = tilt_of(oval), MIN_ANGLE
+    noise = math.sqrt(2.0 * float(np.mean(spread**2)) / len(spread)) if len(spread) >= RAYS // 2 else 1.0
+    if tilt is not None and 0.5 * (1.0 - oval.minor / oval.major) > 4.0 * noise:
+        if _is_confirmed(tilt, radius, rings):
+            # The circle lies half-way between both axes, so that its scale becomes that of the longer one.
+            scale = 0.5 * (1.0 + oval.minor / oval.major) * view.metres_per_pixel
+            return FoundDish(DishView(oval.centre_px, scale), dark_field, tilt, error)
+        unseen = tilt.angle
+    return FoundDish(view, dark_field, None, error, unseen)
 
 
-def _by_dark_rim(
-    gray: Gray, view: DishView, rings: list[Ring], settings: VisionTrackerSettings, diameter: float
-) -> FoundDish:
-    """Return the dish by a dark rim's inner edge; in doubt as any ring's, unless the wall is as dark as steel."""
-    radius = 0.5 * diameter / view.metres_per_pixel
-    _, darkest = rim_points(gray, view.centre_px, radius, REACH * radius, 0.5, RIM_RAYS)
-    level = settings.max_needle_brightness * floor_level(gray, view, diameter)
-    is_wall = len(darkest) > 0 and middle(sampled(gray, darkest)) < level
-    error = SCALE_ERROR if is_wall else _doubt(rings, radius, settings, diameter)
-    tilt, straight = find_tilt(gray, view, diameter)
-    if tilt is not None and not _is_confirmed(tilt, radius, rings):
-        return FoundDish(view, scale_error=error, unseen_tilt=tilt.angle)
-    return FoundDish(straight, tilt=tilt, scale_error=error, unseen_tilt=0.0 if tilt is not None else MIN_ANGLE)
+def _oval_of(points: Points, circle: Ellipse) -> tuple[Ellipse, np.ndarray]:
+    """Return the ellipse of most points near a circle, or the circle, and how far off those lie, as shares of it."""
+    oval = fitted_robustly(points, circle) or circle
+    apart = np.hypot(*oval.coordinates(points).T) - 1.0
+    return oval, apart[np.abs(apart) < FINE_AGREEMENT]
 
 
 def _doubt(rings: list[Ring], radius: float, settings: VisionTrackerSettings, diameter: float) -> float:
     """Return the doubt of a scale by a ring of a radius [px]: that of another ring, if the user names none."""
     if len(rings) == 1:
-        return max(RING_ERROR, 2.0 * WALL / diameter)
+        return max(RING_ERROR, WALL / diameter)
     return max(RING_ERROR, *(abs(ring.ellipse.major / radius - 1.0) for ring in rings if not settings.rim), 0.0)
 
 
-def _by_ring(edge: Ellipse, rings: list[Ring], settings: VisionTrackerSettings, diameter: float) -> FoundDish:
+def _by_ring(gray: Gray, rings: list[Ring], settings: VisionTrackerSettings, diameter: float) -> FoundDish:
     """Return the dish by one of its rings; where none was named, all of them make the doubt of the scale."""
-    error = _doubt(rings, edge.major, settings, diameter)
-    tilt = tilt_of(edge)
-    if tilt is not None and not _is_confirmed(tilt, edge.major, rings):
+    edge = inner_ring(rings, outer=settings.rim == "outer")
+    error, tilt, radius, unseen = _doubt(rings, edge.major, settings, diameter), tilt_of(edge), edge.major, MIN_ANGLE
+    is_cut = not _within(edge.points(RAYS)[0], gray.shape).all()
+    if tilt is not None and (is_cut or not _is_confirmed(tilt, radius, rings)):
         # One edge that is no circle may be a tilted one, or two edges of which each is seen in a part.
-        radius = 0.5 * (edge.major + edge.minor)
-        error = max(error, edge.major / radius - 1.0)
-        return FoundDish(DishView(edge.centre_px, 0.5 * diameter / radius), False, None, error, tilt.angle)
-    view = DishView(edge.centre_px, 0.5 * diameter / edge.major)
-    return FoundDish(view, False, tilt, error, MIN_ANGLE if tilt is None else 0.0)
+        radius, unseen = 0.5 * (edge.major + edge.minor), max(tilt.angle, CUT_TILT if is_cut else 0.0)
+        error, tilt = max(error, edge.major / radius - 1.0), None
+    view = DishView(edge.centre_px, 0.5 * diameter / radius)
+    dark_field = floor_level(gray, view, diameter) < 0.5 * DARK_FLOOR
+    return FoundDish(view, dark_field, tilt, error, unseen if tilt is None else 0.0)
 
 
 def _is_confirmed(tilt: Tilt, radius: float, rings: list[Ring]) -> bool:
     """Say whether another ring than that of a radius [px] has the same tilt."""
-    for ring in rings:
-        other = tilt_of(ring.ellipse)
-        if other is not None and abs(ring.ellipse.major / radius - 1.0) > AGREEMENT and tilt.apart(other) < TILT_ERROR:
-            return True
-    return False
+    others = (tilt_of(ring.ellipse) for ring in rings if abs(ring.ellipse.major / radius - 1.0) > AGREEMENT)
+    return any(other is not None and tilt.apart(other) < TILT_ERROR for other in others)
 
 
 def _scale_remark(error: float) -> str:
@@ -646,9 +681,9 @@ def _with_given(found: FoundDish, settings: VisionTrackerSettings) -> FoundDish 
     error = found.scale_error
     if scale:
         apart = abs(view.metres_per_pixel / scale - 1.0)
-        if apart > 1.0 - INNER_RADIUS:
+        if apart > RANGE:
             return None
-        if apart > max(error, GIVEN_ERROR):
+        if apart > max(error, 3.0 * RING_ERROR):
             remark = f"metres_per_pixel, which is used, is {apart:.0%} off the dish's diameter: one of them is wrong"
         error = apart if remark else settings.scale_error
         view = replace(view, metres_per_pixel=scale)
@@ -656,22 +691,6 @@ def _with_given(found: FoundDish, settings: VisionTrackerSettings) -> FoundDish 
         view = replace(view, centre_px=(centre[0], centre[1]))
     unseen_tilt = found.unseen_tilt if found.unseen_tilt > MIN_ANGLE else 0.0
     return replace(found, view=view, tilt=None, scale_error=error, unseen_tilt=unseen_tilt, remark=remark)
-
-
-def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> FoundDish | None:
-    """Find a dish by its rings alone, as in a photograph: cut, saturated, with a lid, on any ground."""
-    rings = find_rings(image)
-    if not rings:
-        return None
-    gray, edge = measured_channel(image), inner_ring(rings, outer=settings.rim == "outer")
-    found = _by_ring(edge, rings, settings, diameter)
-    if tilt_of(edge) is not None and edge.is_cut(image.shape):
-        view = _find_cut_dish(gray, edge, diameter)
-        if view is None:
-            return None
-        found = replace(found, view=view, tilt=None, unseen_tilt=math.radians(10.0))
-    dark_field = floor_level(gray, found.view, diameter) < 64.0
-    return _with_given(replace(found, dark_field=dark_field), settings)
 
 
 class DishWatch:
@@ -692,7 +711,6 @@ class DishWatch:
         self._settings, self._diameter, self._fixed = settings, diameter, settings.fixed_view()
         self.found: FoundDish | None = None
         self._anew: list[FoundDish] = []
-        self._searched = 0  # frames in a row without a dish
 
     @property
     def view(self) -> DishView | None:
@@ -715,7 +733,7 @@ class DishWatch:
             `FoundDish.prepared`.
         """
         if self._fixed is not None or self.found is None:
-            self.found = self._search(image)
+            self.found = see_dish(image, self._settings, self._diameter)
             if self.found is None:
                 given = "; or correct metres_per_pixel, by which the dish has another size"
                 return NO_DISH + (given if self._settings.metres_per_pixel else ""), image
@@ -723,10 +741,10 @@ class DishWatch:
         prepared = self.found.prepared(image)
         gray, view = measured_channel(prepared), self.found.view
         shift, rays = rim_shift(gray, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
-        if rays >= 0.4 * RIM_RAYS and shift < 1.0:  # px
-            self._anew, self._searched = [], 0
+        if rays >= 0.4 * BINS and shift < 1.0:  # px
+            self._anew = []
             return "", prepared
-        found = self._search(image)
+        found = see_dish(image, self._settings, self._diameter)
         if found is None:
             self._anew = []
             return "too little of the dish is seen: uncover its rim, or give its view", prepared
@@ -741,13 +759,6 @@ class DishWatch:
         self.found, self._anew = found, []
         return "", found.prepared(image)
 
-    def _search(self, image: np.ndarray) -> FoundDish | None:
-        """Look for the dish; in most frames only as long as a live node has time for, until one was found."""
-        long = bool(self._anew) or self._searched % LONG_SEARCH == 0
-        found = see_dish(image, self._settings, self._diameter, photographed=long)
-        self._searched = 0 if found is not None else self._searched + 1
-        return found
-
     def _agree(self, one: FoundDish, other: FoundDish) -> bool:
         """Say whether two dishes are one: within 1 px and 0.5 % of scale, or within two standard deviations."""
         slack = 2.0 * max(one.scale_error, other.scale_error)
@@ -757,117 +768,21 @@ class DishWatch:
         return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(0.005, slack)
 
 
-def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
-    """Find the dish by the inner edge of its rim.
-
-    A circle transform of a small image gives the first guess; then rays from its centre meet the edge
-    where the brightness falls half-way to the rim's dark, with sub-pixel precision, and a circle is
-    fitted to these points, those far from it left out. The edge gives the radius. The centre is that of
-    the rim's darkest ring, which light from one side doesn't shift.
-
-    Args:
-        gray: image, shape (rows, columns), uint8.
-        diameter: the dish's inner diameter [m], which gives the scale.
-
-    Returns:
-        The view, or None if no dish is seen: too few rays agree on a circle.
-    """
-    for rows in (60, 120):  # of the small image; the second only if the first fails
-        guess = _first_guess(gray, rows)
-        fitted = _fit_rim(gray, guess) if guess is not None else None
-        if fitted is None or fitted[0][3] < SHARE_OF_RAYS * RAYS:
-            continue
-        (u, v, radius, _), _, ring = fitted
-        if ring is not None and ring[3] >= SHARE_OF_RAYS * RAYS and math.dist(ring[:2], (u, v)) < AGREEMENT_PX:
-            u, v = ring[:2]
-        elif _is_saturated(gray, (u, v), radius):  # Then the edge lies where the light makes it seem to.
-            continue
-        return DishView((u, v), 0.5 * diameter / radius)
-    return None
-
-
-def _is_saturated(gray: Gray, centre: tuple[float, float], radius: float) -> bool:
-    """Say whether the floor near the rim is as bright as the image can show."""
-    points, _ = Ellipse(centre, 0.93 * radius, 0.93 * radius, 0.0).points(64)
-    columns, rows = np.clip(np.rint(points).astype(int), 0, np.array(gray.shape[::-1]) - 1).T
-    return float(np.mean(gray[rows, columns] >= 253)) > 0.15
-
-
-def _fit_rim(gray: Gray, guess: tuple[float, float, float]) -> tuple[Circle, Points, Circle | None] | None:
-    """Return the circle along a rim's inner edge, that edge, and the circle along the rim's darkest ring.
-
-    None if too few rays agree on the first.
-    """
-    circle, edges, darkest = (*guess, 0), np.empty((0, 2)), np.empty((0, 2))
-    # In shares of the radius: by a first guess, and once it is known.
-    for reach, step in ((0.12, 1.0), (REACH, 0.5)):
-        u, v, radius, _ = circle
-        edges, darkest = rim_points(gray, (u, v), radius, reach * radius, step, RAYS)
-        found = fit_circle(edges, AGREEMENT_PX)
-        if found is None:
-            return None
-        circle = found
-    return circle, edges, fit_circle(darkest, 0.5 * AGREEMENT_PX)
-
-
-def _find_cut_dish(gray: Gray, ellipse: Ellipse, diameter: float) -> DishView | None:
-    """Find a dish that the frame cuts off, near an ellipse, by what is seen of its rim; None if too few rays agree.
-
-    A part of an ellipse does not determine its axes: an edge that is off by a pixel looks like a tilt.
-    """
-    fitted = _fit_rim(gray, (*ellipse.centre_px, 0.5 * (ellipse.major + ellipse.minor)))
-    if fitted is None:
-        return None
-    (u, v, radius, _), edges, ring = fitted
-    points, _ = Ellipse((u, v), radius, radius, 0.0).points(RAYS)
-    inside = ((points > 0.0) & (points < np.array(gray.shape[::-1]) - 1.0)).all(axis=1).sum()
-    if ring is None or ring[3] < 0.75 * inside or inside < 0.4 * RAYS:
-        return None
-    # By an edge that light shifts, a part of a circle tells its centre and its radius apart badly.
-    return DishView(ring[:2], 0.5 * diameter / middle(np.hypot(*(edges - ring[:2]).T)))
-
-
 def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:
     """Look quickly whether the rim is where it was.
 
     Args:
         gray: image, shape (rows, columns), uint8.
-        centre: the dish's centre, as `find_dish` gave it [px].
+        centre: the dish's centre [px].
         radius: and its radius [px].
 
     Returns:
-        How far the circle through the rim's darkest ring has moved since [px], and how many of the `RIM_RAYS` rays
+        How far the circle through the rim's darkest ring has moved since [px], and how many of the `BINS` rays
         agree on it.
     """
-    edges, darkest = rim_points(gray, centre, radius, 7.0, 1.0, RIM_RAYS)
+    edges, darkest = rim_points(gray, centre, radius, 7.0, 1.0, BINS)
     circle = fit_circle(darkest if len(darkest) >= len(edges) // 2 else edges, 0.5 * AGREEMENT_PX)
     return (math.dist(circle[:2], centre), circle[3]) if circle is not None else (0.0, 0)
-
-
-def _first_guess(gray: np.ndarray, rows: int) -> tuple[float, float, float] | None:
-    """Return centre and radius of the strongest large circle, found in a small image of about so many rows [px]."""
-    factor = max(1, round(min(gray.shape) / rows))
-    half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if factor > 1 else gray
-    size = (gray.shape[1] // factor, gray.shape[0] // factor)
-    small = cv2.resize(half, size, interpolation=cv2.INTER_AREA)
-    if np.count_nonzero(cv2.Canny(small, EDGE_LEVEL // 2, EDGE_LEVEL)) > 0.3 * small.size:
-        return None  # All is texture, in which circles agree by chance.
-    minimum = min(small.shape)
-    circles = cv2.HoughCircles(
-        small,
-        cv2.HOUGH_GRADIENT,
-        dp=1,
-        minDist=minimum,
-        param1=EDGE_LEVEL,
-        param2=0.2 * rows,
-        minRadius=int(0.25 * minimum),
-        maxRadius=int(0.55 * minimum),
-    )
-    if circles is None:
-        return None
-    u, v, radius = (float(value) for value in np.asarray(circles).reshape(-1, 3)[0])
-    offset = 0.5 * (factor - 1)
-    return u * factor + offset, v * factor + offset, radius * factor
 
 
 def rim_points(
@@ -886,8 +801,7 @@ def rim_points(
         step: between samples [px].
         rays: how many there are.
     """
-    turns = 2.0 * np.pi * np.arange(rays) / rays
-    ways, count = np.column_stack([np.cos(turns), np.sin(turns)]), int(2.0 * reach / step)
+    ways, count = unit_vectors(rays), int(2.0 * reach / step)
     radii, places = radius - reach + step * np.arange(count), np.arange(count)
     profiles = sampled(gray, centre + radii[:, None] * ways[:, None])
     inside, dark = median(profiles[:, : max(3, count // 8)], axis=1), profiles.min(axis=1)
@@ -919,7 +833,7 @@ def floor_level(gray: np.ndarray, view: DishView, diameter: float) -> float:
     return middle(gray[top:bottom:4, left:right:4])
 
 
-def fit_circle(points: Points, agreement: float) -> Circle | None:
+def fit_circle(points: Points, agreement: float) -> tuple[float, float, float, int] | None:
     """Fit a circle by least squares, leaving out what is far from it.
 
         minimise  sum (x^2 + y^2 - 2 u x - 2 v y - c)^2,    r^2 = c + u^2 + v^2
@@ -952,31 +866,3 @@ def tilt_of(ellipse: Ellipse) -> Tilt | None:
     """Return the tilt under which a circle is seen as an ellipse; None below what one tells."""
     angle = math.acos(min(1.0, ellipse.minor / ellipse.major))
     return Tilt(angle, ellipse.direction) if angle > MIN_ANGLE else None
-
-
-def find_tilt(gray: Gray, view: DishView, diameter: float) -> tuple[Tilt | None, DishView]:
-    """Find the camera's tilt by the ellipse of a rim's darkest ring, or where few of it are seen of its inner edge.
-
-    Args:
-        gray: frame, shape (rows, columns), uint8.
-        view: of the dish as a circle.
-        diameter: of the dish [m].
-
-    Returns:
-        The tilt, None if there is none to be sure of, and the view of the corrected frame.
-    """
-    radius = 0.5 * diameter / view.metres_per_pixel
-    edges, darkest = rim_points(gray, view.centre_px, radius, REACH * radius, 0.5, RAYS)
-    points = darkest if len(darkest) > len(edges) // 2 else edges
-    ellipse = fitted_robustly(points, Ellipse(view.centre_px, radius, radius, 0.0))
-    if ellipse is None:
-        return None, view
-    spread = np.hypot(*ellipse.coordinates(points).T) - 1.0
-    near = np.abs(spread) < FINE_AGREEMENT
-    noise = float(np.sqrt(np.mean(spread[near] ** 2) * 2.0 / near.sum()))
-    tilt = tilt_of(ellipse)
-    if tilt is None or near.sum() < RAYS // 2 or 0.5 * (1.0 - ellipse.minor / ellipse.major) < 4.0 * noise:
-        return None, view
-    # The circle lies half-way between both axes, so that its scale becomes that of the longer one.
-    scale = view.metres_per_pixel * 0.5 * (1.0 + ellipse.minor / ellipse.major)
-    return tilt, DishView(ellipse.centre_px, scale, view.rotation)

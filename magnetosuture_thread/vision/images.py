@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
@@ -214,8 +214,8 @@ class Picture:
     """A frame or a part of it, made ready to measure on.
 
     Attributes:
-        brightest: the greatest of the three colours of each pixel. Steel is dark in all of them, a coloured thread in
-            some only.
+        brightest: the greatest of the three colours of each pixel, or their weighted sum. Steel is dark in all of them,
+            a coloured thread in some only.
         darkest: the least of them. A thread of any colour is dark in one.
         view: where the dish is, in the picture's pixels.
         wall: of the dish, in the picture's pixels.
@@ -246,7 +246,13 @@ def shrunk(image: np.ndarray, factor: int) -> np.ndarray:
     return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def prepare(image: np.ndarray, view: DishView, dish_radius: float, mask: SceneMask | None = None) -> Picture:
+def prepare(
+    image: np.ndarray,
+    view: DishView,
+    dish_radius: float,
+    mask: SceneMask | None = None,
+    weights: tuple[float, ...] = (),
+) -> Picture:
     """Make an image ready to measure on.
 
     Args:
@@ -254,6 +260,7 @@ def prepare(image: np.ndarray, view: DishView, dish_radius: float, mask: SceneMa
         view: where the dish is in it.
         dish_radius: [m]
         mask: where the scene's shapes are in it; None if there are none.
+        weights: of blue, green and red, whose sum is taken for the brightest colour; none: the brightest is.
     """
     wall = Wall(view.centre_px, dish_radius / view.metres_per_pixel)
     places = _floor_places(image.shape[:2], wall)
@@ -262,7 +269,10 @@ def prepare(image: np.ndarray, view: DishView, dish_radius: float, mask: SceneMa
         both = _layer(np.ascontiguousarray(image), places, mask)
         return Picture(both, both, view, wall, mask, image)
     one, two, three = cv2.split(image)
-    brightest = _layer(np.asarray(cv2.max(cv2.max(one, two), three)), places, mask)
+    if weights:
+        brightest = _layer(np.asarray(cv2.transform(image, np.array([weights]))), places, mask)
+    else:
+        brightest = _layer(np.asarray(cv2.max(cv2.max(one, two), three)), places, mask)
     darkest = _layer(np.asarray(cv2.min(cv2.min(one, two), three)), places, mask)
     return Picture(brightest, darkest, view, wall, mask, image)
 
@@ -343,6 +353,18 @@ def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarra
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise InvalidInputError("image.data", "damaged bytes", "a JPEG or PNG image, or BMP, TIFF, WebP, as a whole")
     return eight_bits(image)
+
+
+def upright(image: np.ndarray, data: bytes) -> np.ndarray:
+    """Return an image turned as its EXIF data say, as every viewer shows it; of a camera's frame they say nothing.
+
+    Args:
+        image: as it was decoded.
+        data: the bytes of the picture file, which can be decoded.
+    """
+    turns = {3: cv2.ROTATE_180, 6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
+    turn = turns.get(Image.open(io.BytesIO(data)).getexif().get(ExifTags.Base.Orientation, 1))
+    return image if turn is None else np.asarray(cv2.rotate(image, turn))
 
 
 def eight_bits(image: np.ndarray) -> np.ndarray:

@@ -6,14 +6,14 @@ A dark component may hold the needle's thread too: beside, under or over it, and
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
-from magnetosuture_thread.geometry.compiled import compiled
-from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
-from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, SceneMask, median, middle
+from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize
+from magnetosuture_thread.vision.candidates import DARK_END, Candidate, find_candidates, is_unique
+from magnetosuture_thread.vision.images import RIM_PX, Picture, SceneMask, median, middle
 from magnetosuture_thread.vision.template import (
     BESIDE_PX,
     BLOOM_PX,
@@ -27,17 +27,20 @@ from magnetosuture_thread.vision.template import (
     tail_shift,
 )
 
-AT_WALL = "at the wall"
-MIN_AREA = 0.33  # of the needle's own
-AROUND_PX = 24.0  # around a dark thing, that is measured on
+AROUND_PX, TAIL_REACH = 12.0, 0.2  # around a candidate, that is measured on, beside this share of its length
 MAX_COST = 0.11  # of the length, in squared pixels, of what is no needle
 HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 MAX_MISSING_END, END_ROWS = 0.15, 3  # share of steel that the image may lack at an end, and its rows
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
-BLUNT = 0.7  # bluntness of a tail at least
-CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
+BLUNT, MAX_BLUNT = 0.7, 1.2  # bluntness of a tail; where there is more, what is dark beside it is not of the needle
+MAX_TIP_SIDE = 0.6  # bluntness of a point on its blunter side, where a rod fits nearly as well
+TIP_BEYOND = 0.035  # of the length, by which a ground point reaches farther than the rod that answers best
+ALIKE = 1.1  # times the cost that a rod has where a reflection may make its end look like a point
+MAX_TRIES = 3  # fits of a dark thing that are looked at in full, the best first
+INSIDE = "inside of a shape of the scene"
+BEND_ERROR = 0.2  # rad; of the bend of a drawn needle that fits
 NO_SHAPE = "no needle's shape"
 
 
@@ -45,8 +48,6 @@ def find_needles(
     picture: Picture, size: NeedleSize, toward: np.ndarray | None = None
 ) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find all that may be the needle.
-
-    Dark pixels in the dish form components; each of about the right area is measured.
 
     Args:
         picture: the frame or a part of it.
@@ -57,101 +58,96 @@ def find_needles(
     Returns:
         The needles, and in words why each of the other candidates is none.
     """
-    needles, refused = _measured(picture, size, toward, tight=False)
-    if not needles and refused:
-        # What of a dark shape the tolerance leaves may have grown together with the needle, or the wall is beside it.
-        needles, again = _measured(picture, size, toward, tight=True)
-        refused = [reason for reason in refused if reason != AT_WALL] or again or refused
-    if not needles and refused:
-        dull, _ = _measured(_without_gleam(picture, size.width_px), size, toward, tight=False)
-        needles = [_undirected(needle) if toward is None else needle.pointing(toward) for needle in dull]
-    return needles, refused
+    fits: list[tuple[TemplateFit, SteelMap, int]] = []
+    candidates = find_candidates(picture, size)
+    for candidate in candidates:
+        steel = _steel_at(picture, candidate.arc, size)
+        fits += [(fit, steel, candidate.thing) for fit in _rough_fits(steel, candidate, size)]
+    needles = dict[int, MeasuredNeedle]()  # by the thing that each is in
+    refused: list[str] = []
+    tries = Counter[int]()
+    for fit, steel, thing in sorted(fits, key=lambda each: each[0].cost):
+        arc = fit.arc.shifted(steel.origin)
+        if thing in needles or tries[thing] == MAX_TRIES or any(_lies_on(one, arc, size) for one in needles.values()):
+            continue
+        tries[thing] += 1
+        found = _measured(picture, steel, fit, size, toward)
+        if isinstance(found, MeasuredNeedle):
+            needles[thing] = found
+        else:
+            refused.append(found)
+    if not is_unique(candidates, picture.wall, size):
+        return list(needles.values()), refused
+    axis = _axis_alone(candidates[0], size)
+    if any(each.heading_known or each.confidence > axis.confidence for each in needles.values()):
+        return list(needles.values()), refused
+    if picture.mask is not None and _is_inside(picture.mask, axis, size.width_px):
+        return [], [*refused, INSIDE]
+    return [axis.undirected() if toward is None else axis.pointing(toward)], refused
 
 
-def _undirected(needle: MeasuredNeedle) -> MeasuredNeedle:
-    """Return a needle whose tail may be where its tip is taken to be."""
-    chord, ahead = needle.tip_px - needle.tail_px, needle.direction_px
-    tip = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
-    assert needle.covariance is not None
-    covariance = needle.covariance + np.outer(tip, tip) + np.diag([0.0, 0.0, math.pi**2])
-    confidence = 0.5 * needle.confidence
-    return replace(needle, covariance=covariance, confidence=confidence, heading_known=False, tail_shift_px=0.0)
+def _axis_alone(candidate: Candidate, size: NeedleSize) -> MeasuredNeedle:
+    """Return a needle of which the axis alone is known, as under glare, against the wall or beside a dimple."""
+    aside = 0.2 * size.width_px  # one deviation
+    along = math.hypot(aside, 0.5 * size.tolerance * size.length_px)
+    covariance = np.diag([along, aside, 2.0 * math.sqrt(3.0) * aside / size.length_px]) ** 2
+    confidence = 0.5 * candidate.score
+    return MeasuredNeedle(
+        candidate.arc,
+        size.length_px,
+        size.width_px,
+        confidence=confidence,
+        covariance=covariance,
+        direction_is_clear=False,
+    )
 
 
-def _without_gleam(picture: Picture, width: float) -> Picture:
-    """Return a picture without bright lines that are narrower than a needle [px], as of a lamp along a bare rod."""
-    side = 2 * int(0.35 * width) + 1
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+def _rough_fits(steel: SteelMap, candidate: Candidate, size: NeedleSize) -> list[TemplateFit]:
+    """Return fits of a few rounds at a candidate, in both directions.
 
-    def dull(layer: Layer) -> Layer:
-        return replace(layer, pixels=np.asarray(cv2.morphologyEx(layer.pixels, cv2.MORPH_OPEN, kernel)))
+    Of a length that is not known, what an end that goes on in the dark hides is looked for there too.
+    """
+    length, slack = size.length_px, size.tolerance * size.length_px
+    own = candidate.arc.shifted((-steel.origin[0], -steel.origin[1]))
+    behind, ahead = (end > DARK_END for end in candidate.ends)
+    slides = [0.0, *[-slack] * behind, *[slack] * ahead]
+    axes = [own.moved(slide, 0.0, 0.0, 0.0) for slide in slides]
+    ways = [way for axis in axes for way in (axis, axis.reversed_at(length))]
+    ways += [way.moved(TIP_BEYOND * length, 0.0, 0.0, 0.0) for way in ways[:2]]
+    return [fit_template(steel, way, length, size.width_px, rounds=FIRST_ROUNDS) for way in ways]
 
-    one, is_gray = dull(picture.brightest), picture.darkest is picture.brightest
-    return replace(picture, brightest=one, darkest=one if is_gray else dull(picture.darkest))
+
+def _lies_on(needle: MeasuredNeedle, axis: Arc, size: NeedleSize) -> bool:
+    """Say whether most of an axis lies on a needle."""
+    along, aside = needle.arc.coordinates(axis.at(np.linspace(0.1, 0.9, 9) * size.length_px))
+    on = (np.abs(aside) < size.width_px) & (along > -size.width_px) & (along < needle.length_px + size.width_px)
+    return float(on.mean()) > 0.4
+
+
+def _steel_at(picture: Picture, arc: Arc, size: NeedleSize) -> SteelMap:
+    """Return how much of each pixel around an axis is steel, with nothing known beyond the wall and in shapes."""
+    along, aside = np.linspace(0.0, size.length_px, 48), np.array([-0.25, 0.0, 0.25]) * size.width_px
+    points = np.vstack([arc.at(along, np.full(48, offset)) for offset in aside])
+    steel = SteelMap.around(points, picture, AROUND_PX + TAIL_REACH * size.length_px)
+    steel = steel.hidden_where(picture.wall.distances(steel.box) > picture.wall.radius - RIM_PX)
+    if picture.mask is not None:
+        steel = steel.hidden_where(picture.mask.depth[steel.box] > picture.mask.tolerance_px)
+    return steel
 
 
 def _measured(
-    picture: Picture, size: NeedleSize, toward: np.ndarray | None, *, tight: bool
-) -> tuple[list[MeasuredNeedle], list[str]]:
-    """Find the needles of a size, shapes and wall cut out up to their very outlines if `tight`."""
-    mask, wall = picture.mask, picture.wall
-    radius = wall.radius - RIM_PX if tight else 0.985 * wall.radius  # at first off the rim
-    cut = 0.0 if tight or mask is None else mask.tolerance_px
-    needles: list[MeasuredNeedle] = []
-    refused: list[str] = []
-    candidates = _dark_components(picture, radius, cut, size.length_px * size.width_px, size.max_brightness)
-    if len(candidates) > 6:
-        return [], [f"{len(candidates)} dark things"]
-    for points in candidates:
-        if not tight and np.hypot(*(points - wall.centre).T).max() > radius - 2.0:
-            refused.append(AT_WALL)  # which may have cut off a part
-            continue
-        steel = SteelMap.around(points, picture)
-        near = mask is not None and mask.deepest(points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX) > 0.0
-        if mask is not None and near:
-            steel = steel.hidden_where(mask.depth[steel.box] > cut)
-        if tight:
-            steel = steel.hidden_where(wall.distances(steel.box) > radius)
-        found = measure_needle(steel, size, toward)
-        if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, size.width_px):
-            found = "inside of a shape of the scene"
-        if isinstance(found, MeasuredNeedle):
-            needles.append(found)
-        else:
-            refused.append(found)
-    return needles, refused
-
-
-def _dark_components(picture: Picture, radius: float, cut: float, area: float, limit: float) -> list[np.ndarray]:
-    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2).
-
-    Args:
-        picture: the frame or a part of it.
-        radius: around the dish's centre, beyond which nothing is searched [px].
-        cut: depth in a shape of the scene from which on nothing is searched [px].
-        area: of a needle [px^2].
-        limit: share of the floor's brightness, below which a pixel is dark.
-    """
-    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=limit)
-    dark = cv2.compare(picture.brightest.pixels, bound, cv2.CMP_LT)
-    inside = np.zeros(picture.shape, np.uint8)
-    u, v, reach = (round(16.0 * value) for value in (*picture.wall.centre, radius))
-    cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
-    cv2.bitwise_and(dark, inside, dark)
-    if picture.mask is not None:
-        cv2.bitwise_and(dark, cv2.compare(picture.mask.depth, cut, cv2.CMP_LE), dark)
-    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    result = []
-    for outline in outlines:
-        left, top, width, height = cv2.boundingRect(outline)
-        if width * height < MIN_AREA * area:  # A component is no larger than its box, so most are passed over at once.
-            continue
-        own = np.zeros((height, width), np.uint8)
-        cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-left, -top))
-        rows, columns = np.nonzero(own & dark[top : top + height, left : left + width])
-        if len(rows) >= MIN_AREA * area:
-            result.append(np.column_stack([columns + left, rows + top]).astype(float))
-    return result
+    picture: Picture, steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.ndarray | None
+) -> MeasuredNeedle | str:
+    """Measure the needle at a rough fit; a shape of the scene that keeps it from that is cut out up to its outline."""
+    found = measure_needle(steel, rough, size, toward)
+    if picture.mask is None:
+        return found
+    depth = picture.mask.depth[steel.box]
+    if not isinstance(found, MeasuredNeedle) and (depth > 0.0).any():
+        found = measure_needle(steel.hidden_where(depth > 0.0), rough, size, toward)
+    if isinstance(found, MeasuredNeedle) and _is_inside(picture.mask, found, size.width_px):
+        return INSIDE
+    return found
 
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
@@ -160,61 +156,47 @@ def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
     return middle(depths) > mask.tolerance_px - 0.5 * width
 
 
-def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None = None) -> MeasuredNeedle | str:
-    """Measure the needle in a dark component.
-
-    Axes are guessed by what is as deep in the dark as the body's middle, and by its ends; a drawn needle is fitted from
-    each. Of the best fits the first is taken that nothing covers and of which tail and tip can be told apart.
+def measure_needle(
+    steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.ndarray | None = None
+) -> MeasuredNeedle | str:
+    """Measure the needle near a rough fit.
 
     Args:
         steel: the image around it.
+        rough: to it.
         size: of the needle.
         toward: where it must point, u right and v down; see `find_needles`.
 
     Returns:
         The needle, in the picture's pixels, or in words why there is none.
     """
-    length, width = size.length_px, size.width_px
-    ends = np.array([0.0, length])
-    guesses: list[np.ndarray] = []  # both ends of each
-    fits: list[TemplateFit] = []
-    for level in (0.5, 0.7):  # share of steel: more of a thread over the needle is dark, less of one beside it
-        for guess in axis_guesses(steel.surely > level, length, width):
-            at = guess.at(ends)
-            if not any(np.abs(at - other).max() < 1.5 for other in guesses):
-                guesses.append(at)
-                fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
-        fits.sort(key=lambda fit: fit.cost)
-        if fits and fits[0].cost < 0.03 * length:  # px^2: nothing else is better
-            break
-    found: MeasuredNeedle | str = NO_SHAPE if fits else "no arc"
-    for rough in fits[:3]:
-        if rough.cost > HOPELESS * MAX_COST * length:
-            break
-        found = _checked(steel, rough, size, toward)
-        if isinstance(found, MeasuredNeedle):
-            found = found.shifted(steel.origin)
-            corners = found.arc.at(np.array([0.0, found.length_px]))
-            if corners.min() < 3.0 or (corners > np.array(steel.size) - 4.0).any():
-                return "cut by the image's border"
-            return found
+    if rough.cost > HOPELESS * MAX_COST * size.length_px:
+        return NO_SHAPE
+    found = _checked(steel, rough.arc, size, toward)
+    if not isinstance(found, MeasuredNeedle):
+        return found
+    found = found.shifted(steel.origin)
+    corners = found.arc.at(np.array([0.0, found.length_px]))
+    if corners.min() < 3.0 or (corners > np.array(steel.size) - 4.0).any():
+        return "cut by the image's border"
     return found
 
 
-def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.ndarray | None) -> MeasuredNeedle | str:
+def _checked(steel: SteelMap, guess: Arc, size: NeedleSize, toward: np.ndarray | None) -> MeasuredNeedle | str:
     """Fit to the end, in both directions; return the needle if all looks like one, in one direction."""
     width = size.width_px
-    one, other, rod = _fits(steel, rough, size, size.tolerance)
+    one, other, rod = _fits(steel, guess, size, size.tolerance)
     best = min((one, other, rod), key=lambda each: each.cost)
     if best.cost > CLEARLY * MAX_COST * best.length:  # Of the length as it is set it would cost more.
         return NO_SHAPE
     apart = abs(best.length / size.length_px - 1.0)
     shows_ends = size.tolerance > 0.0 and _shows_ends(steel, best, size)
     is_measured = shows_ends and _needs_length(steel, best, size)
-    shown = steel
+    shown, as_rod = steel, rod.cost
     if size.tolerance > 0.0 and not is_measured:
         shown = steel.unknown_in_glare()
-        one, other, rod = _fits(shown, rough, size, 0.0)
+        one, other, rod = _fits(shown, guess, size, 0.0)
+        as_rod = min(as_rod, rod.cost)
         best = min((one, other, rod), key=lambda each: each.cost)
     # An end that is hidden would make the needle look shorter: where it looks as long as it is set, it is so.
     agrees = shows_ends or apart < SAME_LENGTH
@@ -223,21 +205,28 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         return reason
     if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, 100))) > 0.02:
         return "hidden"
-    if abs(best.arc.curvature) * best.length > 1.25 * math.pi:
-        return "bent beyond a half circle"
+    if abs(best.arc.curvature) * best.length > size.max_bend + BEND_ERROR:
+        return "bent too far"
     excess = _excess(steel.surely, best, width)
     if excess[2] > 0.1:  # of the rows
         return "something dark against it"
-    is_known = True
+    is_known, is_line = True, False
     pointed = min((one, other), key=lambda each: each.cost)
     is_rod = rod.cost < pointed.cost - 0.003 * rod.length * rod.width and _is_rod(steel, rod)
-    fit = None if is_rod else _pointed_way(steel, one, other)
+    # Where a rod fits clearly better, what makes an end look pointed is of something else.
+    is_told_blunt = size.is_blunt or is_rod or CLEARLY * as_rod < pointed.cost
+    fit = None if is_told_blunt else _pointed_way(steel, one, other)
+    if fit is not None and as_rod < ALIKE * fit.cost:
+        # A corner of a rod that a mark, the lamp or the wall takes; of a point with a thread over it a rod fits worse.
+        is_doubtful = steel.is_glaring(fit.arc.at(np.array([0.0, fit.length])))
+        looks_blunt = as_rod < fit.cost and _bluntness(steel.perhaps, fit)[1].max() > MAX_TIP_SIDE
+        fit = None if is_doubtful or looks_blunt else fit
     is_clear = is_rod or max(one.cost, other.cost) > CLEARLY * pointed.cost
     if fit is None:
         if rod.cost > HOPELESS * pointed.cost:  # and so was given up
             tolerance = size.tolerance if is_measured else 0.0
             rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
-        fit, is_known = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
+        fit, is_known, is_line = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
     beyond_tip, beyond_tail, _ = excess if fit is best else _excess(steel.surely, fit, width)
     if reason := _what_prolongs(steel, fit, (beyond_tip, beyond_tail), is_known):
         return reason
@@ -260,16 +249,17 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         size_measured=is_measured,
         tail_shift_px=tail_shift(steel, fit) or 0.0,
         direction_is_clear=is_clear,
+        told_by_line=is_line,
     )
-    return needle if is_known else _undirected(needle)
+    return needle if is_known else needle.undirected()
 
 
 def _fits(
-    steel: SteelMap, rough: TemplateFit, size: NeedleSize, tolerance: float
+    steel: SteelMap, guess: Arc, size: NeedleSize, tolerance: float
 ) -> tuple[TemplateFit, TemplateFit, TemplateFit]:
     """Fit a pointed needle, the same the other way round, and a rod."""
     length, width = size.length_px, size.width_px
-    one = fit_template(steel, rough.arc, length, width, tolerance=tolerance, start=length)
+    one = fit_template(steel, guess, length, width, tolerance=tolerance, start=length)
     bound = HOPELESS * one.cost
     other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length, hopeless=bound)
     rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True, hopeless=bound)
@@ -307,7 +297,7 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if fit.cost > CLEARLY * against.cost:
             continue
         tail, tip = _bluntness(steel.perhaps, fit).min(axis=1).tolist()  # where a coloured thread may hide steel
-        if tail < BLUNT or tip > 0.45:
+        if not BLUNT < tail < MAX_BLUNT or tip > 0.45:
             continue
         their_tail, their_tip = _bluntness(steel.perhaps, against).min(axis=1).tolist()
         signs = (their_tail < 0.5) + (their_tip > 0.6)
@@ -352,12 +342,14 @@ def _what_prolongs(steel: SteelMap, fit: TemplateFit, beyond: tuple[float, float
 
 def _settled(
     steel: SteelMap, fit: TemplateFit, rod: TemplateFit, toward: np.ndarray | None, *, is_rod: bool
-) -> tuple[TemplateFit, bool]:
-    """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
+) -> tuple[TemplateFit, bool, bool]:
+    """Return a needle whose shape does not tell tail and tip apart, whether something else does, and if it is a line.
 
     A thread leaves a rod's tail through its middle, and does not lie over the rod there. One that passes beside one end
     of a pointed needle hides the shape of that end; the other is the tail if it is blunt and no thread goes on there.
     """
+    if toward is not None and abs(float(fit.arc.direction() @ toward)) > 0.8:
+        return _pointing(fit, toward), True, False
     offsets = _thread_offsets(steel, rod)
     if not is_rod and offsets == (None, None) and rod.cost < fit.cost:
         fit = rod
@@ -370,10 +362,8 @@ def _settled(
         leaves = leaves and not _lies_over_tail(steel, replace(rod, arc=tail_first))
         passes = is_pointed and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
         if leaves or passes:
-            return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
-    if toward is not None and abs(float(fit.arc.direction() @ toward)) > 0.8:
-        return _pointing(fit, toward), True
-    return fit, False
+            return _pointing(fit, tail_first.direction(0.5 * rod.length)), True, True
+    return fit, False, False
 
 
 def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:
@@ -388,116 +378,6 @@ def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
     missing, _, _ = _steel_rows(steel, fit, 1.0)
     ends = max(missing[:END_ROWS].mean(), missing[-END_ROWS:].mean())
     return bool(ends < MAX_MISSING_END and max(_excess(steel.surely, fit, fit.width)[:2]) < MAX_BEYOND)
-
-
-def axis_guesses(dark: np.ndarray, length: float, width: float) -> list[Arc]:
-    """Return axes, from the tail on, that a needle may have in a dark component.
-
-    What lies as deep in the dark as the middle of the body is followed: it is either about as long as the needle, which
-    then lies along it, or holds a thread too, and the needle begins or ends at one of its ends.
-
-    Args:
-        dark: where the image is dark, shape (rows, columns), bool.
-        length: of the needle [px].
-        width: of its body [px].
-    """
-    deep = cv2.distanceTransform(dark.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    if deep.max() > 0.5 * 2.6 * width + 1.0:
-        return []
-    inset = CORE * width
-    core = (deep > inset).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
-    result: list[Arc] = []
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    for label in 1 + np.argsort(-areas)[:3]:
-        if stats[label, cv2.CC_STAT_AREA] < 0.25 * (1.0 - 2.0 * CORE) * length * width:
-            continue
-        own = (labels == label).astype(np.uint8)
-        rows, columns = np.nonzero(own)
-        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
-        if guess is None:
-            continue
-        arc, first, last = guess
-        if last - first < 0.5 * length:
-            continue
-        if last - first < 1.35 * length:
-            result += _both(arc, first - inset, last + inset, length)
-        else:
-            result += _from_ends(own, length, width)
-    return result
-
-
-def _both(arc: Arc, first: float, last: float, length: float) -> list[Arc]:
-    """Return an axis in both directions, its tail where the dark begins, and if that goes on for too long, its tip."""
-    forward, backward = arc.moved(first, 0.0, 0.0, 0.0), arc.reversed_at(last)
-    if last - first < length:
-        return [forward, backward]
-    return [forward, backward, forward.reversed_at(length), backward.reversed_at(length)]
-
-
-def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
-    """Return axes that begin or end at the ends of a long, winding core."""
-    result: list[Arc] = []
-    rows, columns = np.nonzero(own)
-    steps = np.empty(own.shape, np.int32)
-    _walk(own, rows[0], columns[0], steps)
-    last = int(np.argmax(steps))
-    _walk(own, last // own.shape[1], last % own.shape[1], steps)
-    size = 2 * int(0.5 * width + 2.0) + 1
-    highest = cv2.dilate(steps.astype(np.float32), np.ones((size, size), np.uint8))
-    at = np.argwhere((steps == highest) & (own > 0))
-    ends = [np.array([last // own.shape[1], last % own.shape[1]])]
-    for place in at[np.argsort(-steps[at[:, 0], at[:, 1]])]:
-        if len(ends) < 5 and min(np.abs(place - other).max() for other in ends) > size:
-            ends.append(place)
-    for row, column in ends:
-        _walk(own, row, column, steps)
-        rows, columns = np.nonzero((steps >= 0) & (steps < 0.8 * length))
-        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
-        if guess is None:
-            continue
-        arc, first, final = guess
-        end = float(arc.coordinates(np.array([[column, row]], float))[0][0])
-        # From the end inwards; a point reaches farther than its core, by the part that is too thin for it.
-        inwards = arc.moved(first, 0.0, 0.0, 0.0) if end - first < final - end else arc.reversed_at(final)
-        for beyond in (0.1 * length, 0.03 * length):
-            result.append(inwards.moved(-beyond, 0.0, 0.0, 0.0).reversed_at(length))
-        result.append(inwards.moved(-CORE * width, 0.0, 0.0, 0.0))
-    return result
-
-
-def _axis_of(points: np.ndarray, width: float) -> tuple[Arc, float, float] | None:
-    """Return an arc through most of the points, and the lengths along it between which these lie."""
-    kept = points
-    for _ in range(4):
-        if len(kept) < 8:
-            return None
-        arc = fit_arc(kept)
-        along, aside = arc.coordinates(points)
-        near = np.abs(aside) < max(0.5 * width, 1.5 * middle(np.abs(aside)))
-        if near.sum() == len(kept):
-            break
-        kept = points[near]
-    return arc, float(along[near].min()), float(along[near].max())
-
-
-@compiled
-def _walk(own, row, column, steps):
-    """Fill in how many steps from a pixel each pixel of its component is, -1 elsewhere."""
-    steps[:] = -1
-    rows, columns = own.shape
-    queue = np.empty((rows * columns, 2), np.int32)
-    queue[0, 0], queue[0, 1], steps[row, column] = row, column, 0
-    head, tail = 0, 1
-    while head < tail:
-        r, c = queue[head]
-        head += 1
-        for y in range(max(0, r - 1), min(rows, r + 2)):
-            for x in range(max(0, c - 1), min(columns, c + 2)):
-                if own[y, x] != 0 and steps[y, x] < 0:
-                    steps[y, x] = steps[r, c] + 1
-                    queue[tail, 0], queue[tail, 1] = y, x
-                    tail += 1
 
 
 def _across(fit: TemplateFit, half: float) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,9 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation
 from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import output_problem
+from magnetosuture_thread.settings.files import output_problem, whole_file
+from magnetosuture_thread.vision.refused import Refused
+from magnetosuture_thread.vision.teaching import Taught
 from magnetosuture_thread.vision.tracker import State, Track
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
@@ -67,11 +69,46 @@ def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: floa
     _circle(image, np.asarray(centre_px), radius_px, DISH, 1)
 
 
+def draw_refused(image: np.ndarray, refused: Sequence[Refused]) -> None:
+    """Draw what was not taken for the needle into a BGR image, each with its reason below it."""
+    unit = max(1, round(min(image.shape[:2]) / 480))
+    for each in refused:
+        _line(image, np.vstack([each.outline_px, each.outline_px[:1]]), PLATES[State.LOST], unit)
+        at = 8 * unit, int(each.outline_px[:, 1].max()) + 16 * unit
+        cv2.putText(image, each.reason, at, FONT, 0.42 * unit, PLATES[State.LOST], unit, cv2.LINE_AA)
+
+
+def draw_taught(image: np.ndarray, taught: Taught) -> np.ndarray:
+    """Return a BGR image of what was learnt: the frame with the needle's ends, beside it what the filter looks at.
+
+    Its best answer is in the needle's colour with its score, all others are in that of refused things.
+    """
+    frame = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    unit = max(1, round(min(frame.shape[:2]) / 480))
+    mask = cv2.cvtColor(taught.dark, cv2.COLOR_GRAY2BGR)
+    mask[taught.dark == 0] = DISH  # where nothing is looked for
+    for index, (ends, score) in enumerate(taught.answers):
+        colour = PLATES[State.LOST] if index else NEEDLE
+        _line(mask, ends, colour, unit)
+        u, v = (int(value) for value in ends.max(axis=0))
+        cv2.putText(mask, f"{score:.2f}", (u + 4 * unit, v), FONT, 0.5 * unit, colour, unit, cv2.LINE_AA)
+    _line(frame, taught.ends, NEEDLE, unit)
+    _circle(frame, taught.ends[0], 4.0 * unit, NEEDLE, unit)
+    _circle(frame, taught.ends[1], 2.0 * unit, (40, 200, 255), -1)
+    return np.hstack([frame, mask])
+
+
 def draw_region(image: np.ndarray, region_px: Sequence[float]) -> None:
     """Draw the part of the frame that is looked at, left, top, right and bottom [px], into a BGR image."""
     if region_px:
         left, top, right, bottom = (int(value) for value in region_px)
         cv2.rectangle(image, (left, top), (right - 1, bottom - 1), DISH, 1)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write a BGR picture as PNG, as a whole or not at all."""
+    with whole_file(path) as partial:
+        partial.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 class OverlayWriter:

@@ -41,6 +41,23 @@ class VisionTrackerSettings(
         minimum=0.1,
         maximum=0.95,
     )
+    needle_colour: tuple[float, ...] = quantity(
+        (),
+        "weights of blue, green and red that tell the needle from the floor, as `teach` measures; not given: all dark",
+        minimum=0.0,
+        maximum=1.0,
+        multiple=3,
+    )
+    needle_is_blunt: bool = quantity(
+        False, "whether both ends of the needle look alike, so that neither looks like a tip"
+    )
+    max_needle_bend: float = quantity(
+        4.0,
+        "angle that the needle turns by from end to end, at most; 0: straight",
+        unit="rad",
+        minimum=0.0,
+        maximum=4.0,
+    )
     outline_tolerance: float = quantity(
         0.0003,
         "what the outline of a shape of the scene and the visible one may differ by, for parallax and calibration",
@@ -104,6 +121,9 @@ class VisionTrackerSettings(
             raise ConfigurationError(name, self.dish_centre_px, "u and v [px], or no entries to find the dish")
         if len(self.region_px) > 4:
             raise ConfigurationError(f"{self.GROUP}.region_px", self.region_px, "left, top, right, bottom [px]")
+        if self.needle_colour and (len(self.needle_colour) > 3 or not 0.9 < sum(self.needle_colour) < 1.1):
+            name = f"{self.GROUP}.needle_colour"
+            raise ConfigurationError(name, self.needle_colour, "three weights whose sum is 1, or no entries")
         if self.straightening:
             name, matrix = f"{self.GROUP}.straightening", self.homography()
             if len(self.straightening) > 9 or matrix is None or abs(np.linalg.det(matrix)) < 1e-12:

@@ -22,7 +22,6 @@ from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, co
 from magnetosuture_thread.vision.arc import Arc
 from magnetosuture_thread.vision.images import NEXT, Layer, Picture
 
-AROUND_PX = 12.0  # around a dark thing, that is measured on
 GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
 GLARE_REACH_PX = 4  # around a place, that it is looked for, and over which it fades
 SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
@@ -108,11 +107,11 @@ class SteelMap:
         return slice(top, top + rows), slice(left, left + columns)
 
     @staticmethod
-    def around(points: np.ndarray, picture: Picture) -> SteelMap:
-        """Return the map around the points of a dark thing, shape (m, 2) [px]."""
+    def around(points: np.ndarray, picture: Picture, reach: float) -> SteelMap:
+        """Return the map around the points of a dark thing, shape (m, 2), as far as a reach [px]."""
         rows, columns = picture.shape
-        left, top = np.maximum(points.min(axis=0) - AROUND_PX, 0.0).astype(int)
-        right, bottom = np.minimum(points.max(axis=0) + AROUND_PX, (columns, rows)).astype(int)
+        left, top = np.maximum(points.min(axis=0) - reach, 0.0).astype(int)
+        right, bottom = np.minimum(points.max(axis=0) + reach, (columns, rows)).astype(int)
         box = slice(top, bottom), slice(left, right)
         dark = _darkness(picture.brightest, box)
         u, v = np.round(points - (left, top)).astype(int).T

@@ -34,15 +34,17 @@ from magnetosuture_thread.vision.images import (
     shrunk,
 )
 from magnetosuture_thread.vision.lens import Lens
-from magnetosuture_thread.vision.needle import axis_guesses, find_needles
+from magnetosuture_thread.vision.needle import find_needles
 from magnetosuture_thread.vision.observe import observe
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.settings import VisionTrackerSettings, scaled_homography
 from magnetosuture_thread.vision.walk import Ridge, smoothed, walk_on, worth
 
 SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 UNDIRECTED = "the needle's axis is found, but not which end is the tip: click it on the page, or by --tip or needle/tip"
+NO_NEEDLE = "no needle in the dish"
 TIP_REACH = 1.0 / 3.0  # of the length, from a point that a person gives: the other end is then twice as far or more
+TIP_LOST = "the point at the tip is too old, or farther from the needle's ends than a third of its length: point again"
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 SEARCH_PERIOD = 0.25  # s between frames of which all is searched for a thread that seems cut; it takes a frame's time
 REPEATED = "camera repeats frames"
@@ -79,6 +81,8 @@ class Track:
         needle_length: measured over the first frames [m]; None until it is, and of a frame looked at alone.
         observation: the pieces of the thread that are seen, in the dish frame.
         scale_error: standard deviation of the view's scale, as a share; 0 where the scale is given.
+        straightening: homography from the frame to the one in which the view holds, shape (3, 3); None: the same.
+        dark_field: whether the floor is dark, and the needle bright.
     """
 
     state: State
@@ -95,6 +99,19 @@ class Track:
     needle_length: float | None = None
     observation: ThreadObservation = field(default_factory=ThreadObservation)
     scale_error: float = 0.0
+    straightening: np.ndarray | None = None
+    dark_field: bool = False
+
+    def place_of(self, point_px: Points) -> Points:
+        """Return where a point (u, v) of a frame is in its dish, of which there must be a view, shape (2,) [m]."""
+        assert self.view is not None
+        u, v, w = (np.eye(3) if self.straightening is None else self.straightening) @ [*point_px, 1.0]
+        return self.view.to_dish(np.array([u / w, v / w]))
+
+    def prepared(self, image: np.ndarray) -> np.ndarray:
+        """Return the frame, without the lens's distortion, as the view holds in it, with a bright floor."""
+        assert self.view is not None
+        return FoundDish(self.view, self.dark_field, homography=self.straightening).prepared(image)
 
     @property
     def axis(self) -> Points:
@@ -151,6 +168,7 @@ class VisionTracker:
         self._given = settings
         self._scene = scene
         self._tip: tuple[Points, float] | None = None  # place, and the last time that it is of
+        self._tip_loss = ""  # why it was not used
         self._lens: Lens | None = None
         self._mask: tuple[Any, SceneMask | None] = ((), None)  # what it was made for, and the mask
         self._shape: tuple[int, ...] = ()
@@ -192,22 +210,23 @@ class VisionTracker:
         self._length = LengthEstimator()
         self._last: _Pose | None = None
         self._anew: list[_Pose] = []
+        self._is_pointed_at = False  # whether a person told the direction of the poses that have to agree
         self._thread: Points = np.empty((0, 2))  # in pixels, with the needle's ends
         self._searched = -math.inf  # time of the last frame that was searched as a whole for the thread
 
     def point_at_tip(self, place: Points, until: float = math.inf) -> None:
         """Take a point near the needle's tip, as a person gives it.
 
-        It is used in the next frame in which a needle is found, where nothing else tells its direction, and if an end
-        of it is nearer to the point than a third of its length. From then on the direction is carried from frame to
-        frame as long as the needle cannot have turned round unseen.
+        It is kept until a needle is tracked whose direction nothing else tells, and of which an end is nearer to the
+        point than a third of its length. Where none is as near it is lost, which the frame's warning says. From then on
+        the direction is carried from frame to frame as long as the needle cannot have turned round unseen.
 
         Args:
             place: shape (2,) [m].
             until: time of the last frame that it is of [s], by the clock of the frames.
         """
         self._tip = np.array(place, dtype=float), until
-        self._last, self._anew = None, []
+        self._last, self._anew, self._is_pointed_at = None, [], False
 
     def look(self, image: np.ndarray) -> Track:
         """Look at one frame alone; what other frames showed doesn't matter.
@@ -253,18 +272,24 @@ class VisionTracker:
         left, top, right, bottom = self._region_px
         found = self._track(np.ascontiguousarray(small[top:bottom, left:right]), time_s, on_pose)
         dish = self._dish.found.warning if self._dish.found is not None else ""
-        warning = "; ".join(filter(None, (dish, f"{problem}; it is not used" if problem is not None else "")))
+        lens = f"{problem}; it is not used" if problem is not None else ""
+        warning, self._tip_loss = "; ".join(filter(None, (dish, lens, self._tip_loss))), ""
         found = replace(found, warning=warning, needle_length=self._length.length, scale_error=self._dish.scale_error)
         if found.view is None:
             return found
         u, v = found.view.centre_px
         view = replace(found.view, centre_px=(u + left, v + top)).shrunk(1.0 / self._factor)
-        return replace(found, view=view)
+        if (ring := self._dish.found) is None:
+            return replace(found, view=view)
+        straight = ring.straightening()
+        if straight is not None:
+            straight = scaled_homography(scaled_homography(straight, 1.0, -left, -top), 1.0 / self._factor)
+        return replace(found, view=view, straightening=straight, dark_field=ring.dark_field)
 
     def _track(self, image: np.ndarray, time_s: float, on_pose: PoseCallback | None) -> Track:
         """Look at the next frame, shrunk."""
-        if self._last is not None and time_s - self._last.time > self._settings.forget_after:
-            self._last = None
+        if self._before is not None and time_s - self._before.time > self._settings.forget_after:
+            self._last, self._anew, self._is_pointed_at = None, [], False
         before = self._dish.view
         reason, image = self._dish.look(image)
         view = self._dish.view
@@ -287,9 +312,9 @@ class VisionTracker:
             line, observation = self._measured(complete, needle, search=True)
         if searches:
             self._searched = time_s
+        if needle.size_measured:
+            self._length.add((needle.length_px - needle.tail_shift_px) * view.metres_per_pixel, needle.confidence)
         if needle.heading_known:
-            if needle.size_measured:
-                self._length.add((needle.length_px - needle.tail_shift_px) * view.metres_per_pixel, needle.confidence)
             self._thread = view.to_pixels(np.vstack([pose.tail, pose.tip, line]))
         return replace(pose, centreline=line, view=view, observation=observation)
 
@@ -326,7 +351,7 @@ class VisionTracker:
         mask = self._mask_for(image, view)
         part = mask.part(left, top, right, bottom) if mask is not None else None
         local = replace(view, centre_px=(view.centre_px[0] - left, view.centre_px[1] - top))
-        return prepare(image[top:bottom, left:right], local, radius, part)
+        return prepare(image[top:bottom, left:right], local, radius, part, self._settings.needle_colour)
 
     def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
         """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
@@ -345,16 +370,19 @@ class VisionTracker:
         """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
         view, last, settings = self._found_dish().view, self._last, self._settings
         size = self._length.size(settings.needle_length, settings.needle_width, view.metres_per_pixel)
-        size = replace(size, max_brightness=settings.max_needle_brightness)
+        size = replace(size, max_brightness=settings.max_needle_brightness, max_bend=settings.max_needle_bend)
+        size = replace(size, is_blunt=settings.needle_is_blunt)
         for whole in (False, True) if last is not None else (True,):
             picture = self._picture(image, None if whole else self._region(image, view, time))
             toward = self._toward(view, time)
             needles, refused = find_needles(picture, size, toward)
+            needles = [self._proven(needle, picture) for needle in needles]
             if toward is None and (pointed := self._pointed_at(needles, picture, time)) is not None:
                 needles, _ = find_needles(picture, size, pointed.direction_px)
                 needles = [each for each in needles if math.dist(each.tip_px, pointed.tip_px) < 0.5 * each.length_px]
             elif toward is not None and whole and not self._near_before(needles, picture, time):
                 needles, refused = find_needles(picture, size, None)  # it is elsewhere, and may have turned round
+                needles = [self._proven(needle, picture) for needle in needles]
             needles = [self._as_before(needle, picture, time) for needle in needles]
             within = [needle for needle in needles if self._fits(_pose(needle, picture, time), last)]
             if len(within) == 1 and not (whole and not within[0].heading_known):
@@ -364,12 +392,12 @@ class VisionTracker:
             self._anew = []
             remedy = "check light, needle_length, needle_width, max_needle_brightness"
             others = f"; dark things: {', '.join(refused)}" if refused else ""
-            return None, None, True, f"no needle in the dish; {remedy}{others}"
+            return None, None, True, f"{NO_NEEDLE}; {remedy}{others}"
         chosen = within[0] if len(within) == 1 else self._with_thread(picture, needles)
-        if chosen is None or not chosen.heading_known:
+        if chosen is not None and not chosen.heading_known:  # It neither confirms a direction nor speaks against it.
+            return chosen, picture, True, ""
+        if chosen is None:
             self._anew = []
-            if chosen is not None:
-                return chosen, picture, True, ""
             remedy = "point at the tip of one, or limit region_px"
             return None, None, True, f"{len(needles)} needles in the dish: {remedy}"
         pose = _pose(chosen, picture, time)
@@ -386,6 +414,16 @@ class VisionTracker:
             return None, None, True, "a needle farther from the last one than it can move"
         return None, None, True, f"a needle seen in {len(self._anew)} of {settings.confirm_frames} frames"
 
+    def _proven(self, needle: MeasuredNeedle, picture: Picture) -> MeasuredNeedle:
+        """Return a needle without a direction that a line alone tells, unless the line is its thread, and all of it.
+
+        A line that is drawn on the floor leaves an end as a thread does, but is not as long, with an end of its own.
+        """
+        if not needle.told_by_line:
+            return needle
+        _, observation = self._measured(picture, needle, search=False)
+        return needle if observation.complete else needle.undirected()
+
     @property
     def _before(self) -> _Pose | None:
         """The last pose, or that which the next frames have to agree with; None without any."""
@@ -400,6 +438,8 @@ class VisionTracker:
         before = self._before
         if before is None or self._most_turned(time - before.time) > 0.5 * math.pi:
             return None
+        if self._last is None and not self._is_pointed_at:  # Each frame that confirms a direction must tell it itself.
+            return None
         _, angle = before.at(time)
         return view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
 
@@ -407,13 +447,16 @@ class VisionTracker:
         """Return the needle that a person points at, with its tip there; see `point_at_tip`."""
         if self._tip is None or not needles:
             return None
-        (place, until), self._tip = self._tip, None
-        if time > until:
-            return None
+        place, until = self._tip
         tip = picture.view.to_pixels(place)
         ways = [way for needle in needles if not needle.heading_known for way in (needle, needle.reversed())]
         near = [way for way in ways if math.dist(way.tip_px, tip) < TIP_REACH * way.length_px]
-        return min(near, key=lambda way: math.dist(way.tip_px, tip), default=None)
+        if near and time <= until:
+            self._is_pointed_at = True
+            return min(near, key=lambda way: math.dist(way.tip_px, tip))
+        if ways or time > until:
+            self._tip, self._tip_loss = None, TIP_LOST
+        return None
 
     def _with_thread(self, picture: Picture, needles: list[MeasuredNeedle]) -> MeasuredNeedle | None:
         """Return the only needle that a thread leaves, of those that were found; one that is alone needs no thread."""
@@ -531,8 +574,9 @@ class VisionTracker:
             velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         direction_is_clear = pose.direction_is_clear or (before is not None and before.direction_is_clear)
+        self._tip = None
         self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate, direction_is_clear)
-        self._anew = []
+        self._anew, self._is_pointed_at = [], False
 
     def _region(self, image: np.ndarray, view: DishView, time: float) -> tuple[int, int, int, int]:
         """Return the box in which needle and thread should be: left, top, right, bottom [px]."""
@@ -696,9 +740,6 @@ def warm_up() -> bool:
     image = cv2.GaussianBlur(image, (0, 0), 0.9)
     # What a plain frame does not reach: a needle in one dark thing with its thread, crossings, and other pieces.
     sampled(np.zeros((4, 4), np.float32), np.zeros((1, 2)))
-    core = np.zeros((60, 60), np.uint8)
-    core[10, 5:55] = core[10:50, 54] = core[49, 5:55] = 1  # long and winding
-    axis_guesses(cv2.dilate(core, np.ones((5, 5), np.uint8)) > 0, 30.0, 5.0)
     path, strong, nothing = np.zeros((8, 6)), np.zeros(8, np.bool_), np.zeros((16, 16), np.uint8)
     walk_on(Ridge(nothing, nothing, 1.0, 1.0), (8.0, 8.0, 8.0), 4.0, path, strong, 1)
     worth(path, strong, 1)

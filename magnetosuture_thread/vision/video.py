@@ -44,12 +44,11 @@ class Video:
         self.count = max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
-        """Go through the frames that can be decoded, their pixels as the sensor has them, as those of pictures.
+        """Go through the frames that can be decoded, turned as players show them, as pictures are.
 
         Each has the time since the first one [s], that of the file where no rate was given: it may vary.
         """
         video = cv2.VideoCapture(str(self._path))
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         number = 0
         while (taken := video.read())[0]:
             told = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)

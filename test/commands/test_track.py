@@ -21,6 +21,7 @@ from magnetosuture_thread.evaluation.recorded import read_image
 from magnetosuture_thread.settings.interface import COMPRESSED_IMAGE
 from test.bags.bags import copy_with_notes
 from test.vision.scenes import rod
+from test.vision.test_images import oriented_jpeg
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
 
@@ -76,6 +77,89 @@ def test_a_needle_without_a_thread_has_an_axis_and_a_pose_once_its_tip_is_given(
             assert row["status"] == "tracked"
             assert row["tail_m"] == pytest.approx(tail, abs=2e-4)
             assert row["tip_m"] == pytest.approx(tip, abs=2e-4)
+
+
+ENDS = np.array([[-0.004, 0.002], [0.003, 0.002]])
+
+
+def seen_in(pictures: list[Path], file: Path, *given: str) -> list[dict[str, Any]]:
+    """Return what `track` writes of pictures."""
+    assert cli.main(["track", *map(str, pictures), "--json", str(file), *given]) in (0, 1)
+    return list(json.loads(file.read_text()))
+
+
+def test_who_gets_no_needle_is_told_what_would_admit_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    picture, drawn = tmp_path / "rod.png", tmp_path / "drawn"
+    cv2.imwrite(str(picture), rod(ENDS))
+    (row,) = seen_in([picture], tmp_path / "seen.json", "--needle", "0.011", "0.0004", "--overlay", str(drawn))
+    assert row["axis_m"] is None
+    assert len(row["refused"]) == 1
+    assert "if it is the needle, set needle_length 0.00" in row["refused"][0]
+    assert "needle_width" not in row["refused"][0]
+    assert "if it is the needle, set needle_length" in capsys.readouterr().out
+    red, green = (np.asarray(cv2.imread(str(drawn / "rod.png")))[200:225, :, channel].astype(int) for channel in (2, 1))
+    assert (red - green > 60).sum() > 50  # its outline
+    length = row["refused"][0].split("needle_length ")[1]
+    (row,) = seen_in([picture], tmp_path / "seen.json", "--needle", length, "0.0004")
+    assert row["axis_m"] is not None
+    assert row["refused"] == []
+    cv2.imwrite(str(picture), rod(ENDS, level=150))
+    (row,) = seen_in([picture], tmp_path / "seen.json")
+    share = row["refused"][0].split("max_needle_brightness ")[1]
+    (row,) = seen_in([picture], tmp_path / "seen.json", "--needle-brightness", share)
+    assert row["axis_m"] is not None
+
+
+def test_the_tip_is_kept_until_it_is_used_and_its_loss_is_said(tmp_path: Path):
+    files = [tmp_path / "frames" / f"{index}.png" for index in range(6)]
+    files[0].parent.mkdir()
+    for index, file in enumerate(files):
+        frame = rod(np.add(ENDS, (0.0, 0.0001 * index)))
+        if index in (0, 2):  # nothing to see, and before the pose is confirmed
+            cv2.circle(frame, (322, 213), 110, (200, 200, 200), -1)
+        cv2.imwrite(str(file), frame)
+    for given in (["--tip", "0.003", "0.002"], ["--tip-px", "359.5", "213"]):
+        rows = seen_in([files[0].parent], tmp_path / "seen.json", *given)
+        assert rows[-1]["status"] == "tracked"
+        assert rows[-1]["tip_m"] == pytest.approx([0.003, 0.0025], abs=2e-4)
+    rows = seen_in([files[0].parent], tmp_path / "seen.json", "--tip", "0.012", "-0.002")
+    lost = [
+        row["warning"] is not None and "the point at the tip is too old, or farther" in row["warning"] for row in rows
+    ]
+    assert lost == [False, True, False, False, False, False]
+    assert rows[-1]["tip_m"] is None
+
+
+def test_what_calibrate_camera_writes_suffices_to_track(tmp_path: Path):
+    files = [tmp_path / "frames" / f"{index}.png" for index in range(10)]
+    files[0].parent.mkdir()
+    for index, file in enumerate(files):
+        ends = np.array([[-0.004, 0.004 - 0.001 * index], [0.001, 0.004 - 0.001 * index]])
+        cv2.imwrite(str(file), np.hstack([np.full((480, 200, 3), 120, np.uint8), rod(ends)]))
+    camera = tmp_path / "camera.yaml"
+    command = ["calibrate-camera", str(files[0].parent), "--dish-diameter", "0.035", "--needle", "0.005", "0.0004"]
+    assert cli.main([*command, "--region", "200", "0", "840", "480", "--output", str(camera)]) == 0
+    rows = seen_in(files, tmp_path / "seen.json", "--setup", str(camera), "--dish-diameter", "0.035")
+    assert all(row["axis_m"] is not None for row in rows)
+
+
+def test_a_setup_is_read_for_what_the_tracker_needs_of_it_alone(tmp_path: Path):
+    setup, picture = tmp_path / "thick.yaml", tmp_path / "rod.png"
+    setup.write_text("/**: {ros__parameters: {scene: dish_35mm, needle_width: 0.0012}}\n")  # more than twice keep_out
+    cv2.imwrite(str(picture), rod(ENDS))
+    assert len(seen_in([picture], tmp_path / "seen.json", "--setup", str(setup))) == 1
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_pictures_are_seen_and_drawn_as_viewers_show_them(orientation: int, tmp_path: Path):
+    stored = {1: None, 3: cv2.ROTATE_180, 6: cv2.ROTATE_90_COUNTERCLOCKWISE, 8: cv2.ROTATE_90_CLOCKWISE}[orientation]
+    frame = rod(ENDS)
+    picture, drawn = tmp_path / "phone.jpg", tmp_path / "drawn"
+    picture.write_bytes(oriented_jpeg(frame if stored is None else cv2.rotate(frame, stored), orientation))
+    (row,) = seen_in([picture], tmp_path / "seen.json", "--tip-px", "359.5", "213", "--overlay", str(drawn))
+    assert row["dish_centre_px"] == pytest.approx([322.0, 238.0], abs=0.5)
+    assert row["tip_m"] == pytest.approx(ENDS[1], abs=2e-4)
+    assert np.asarray(cv2.imread(str(drawn / "phone.png"))).shape == frame.shape
 
 
 def test_a_part_of_a_frame_is_looked_at_and_a_bright_needle_is_found(tmp_path: Path):
@@ -146,6 +230,16 @@ def test_a_folder_is_followed_over_time_in_the_order_of_its_numbers(
     assert {row["stamp_s"] for row in json.loads((tmp_path / "seen.json").read_text())} == {None}
 
 
+def test_a_folder_of_pictures_that_do_not_follow_one_another_is_searched_one_by_one(tmp_path: Path, capsys):
+    shutil.copytree(SAMPLES, tmp_path / "frames")
+    rows = seen_in([tmp_path / "frames"], tmp_path / "seen.json")
+    assert [(row["status"], row["stamp_s"]) for row in rows] == [("tracked", None)] * 5
+    truth = json.loads((SAMPLES / "truth.json").read_text())["frames"]
+    for row, true in zip(rows, truth, strict=True):
+        np.testing.assert_allclose(row["tail_m"], np.array(true["tail_mm"]) * 1e-3, atol=1e-4)
+    assert "is no video, as its needle jumps" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_video_is_followed_over_time_and_one_that_is_cut_off_is_reported(
     short_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -170,15 +264,6 @@ def test_paths_without_frames_are_refused_in_one_line(tmp_path: Path, capsys: py
     for name, words in cases.items():
         assert cli.main(["track", str(tmp_path / name)]) == 1
         assert words in error_of(capsys)
-
-
-def test_a_calibration_is_written_as_parameters(tmp_path: Path):
-    file = tmp_path / "camera.yaml"
-    assert cli.main(["calibrate-camera", str(SAMPLES), "--dish-diameter", "0.035", "--output", str(file)]) == 0
-    assert yaml.safe_load(file.read_text())["/**/vision_tracker"]["ros__parameters"]["metres_per_pixel"] > 0.0
-    given = ["--setup", str(file), "--scene", "dish_35mm", "--json", str(tmp_path / "seen.json")]
-    assert cli.main(["track", *map(str, SAMPLES.glob("*.png")), *given]) == 0
-    assert {row["status"] for row in json.loads((tmp_path / "seen.json").read_text())} == {"tracked"}
 
 
 def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(

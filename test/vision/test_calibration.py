@@ -21,7 +21,7 @@ from magnetosuture_thread.vision.calibration import (
 )
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
-from test.vision.scenes import SCENE, VIEW, Pose, render
+from test.vision.scenes import SCENE, VIEW, Pose, render, rod
 
 SPACING, SIDE = 0.034, 0.005
 
@@ -95,6 +95,16 @@ def test_markers_from_a_camera_that_moved_between_frames_are_refused():
         calibrate_by_markers([markers(view, (0, 1)), markers(nudged, (1, 2, 3))], 0.035, SPACING, SIDE)
 
 
+def test_the_length_of_a_rod_without_a_thread_is_measured_also_where_some_frames_are_wrong():
+    images = []
+    for index in range(14):
+        beginning = np.array([-0.008 + 0.0009 * index, 0.008 - 0.001 * index])
+        length = 0.0053 if index % 5 == 2 else 0.005  # as where something dark lies at an end
+        images.append(rod(np.array([beginning, np.add(beginning, (length, 0.0))])))
+    length = measure_needle_length(images, calibrate_by_dish(images, 0.035), 0.0052, 0.0004)
+    assert length == pytest.approx(0.005, rel=0.02)
+
+
 @pytest.mark.parametrize("share", [0.93, 1.07])
 def test_the_needles_length_is_measured_over_frames_and_written_for_every_node(share: float, tmp_path: Path):
     poses = [Pose(np.array([-0.004 + 0.0008 * index, 0.003 - 0.0006 * index]), 0.5 * index) for index in range(10)]
@@ -103,8 +113,9 @@ def test_the_needles_length_is_measured_over_frames_and_written_for_every_node(s
     length = measure_needle_length(images, found, share * 0.007, 0.0004)
     assert length == pytest.approx(0.007, rel=0.01)
     file = tmp_path / "camera.yaml"
-    file.write_text(replace(found, needle_length=length).to_yaml())
-    assert load_setup(file, (VisionTrackerSettings,))["vision_tracker"].needle_length == pytest.approx(length, abs=1e-6)
+    file.write_text(replace(found, needle=(length, 0.00041)).to_yaml())
+    settings = load_setup(file, (VisionTrackerSettings,))["vision_tracker"]
+    assert (settings.needle_length, settings.needle_width) == pytest.approx((length, 0.00041), abs=1e-6)
     with pytest.raises(InvalidInputError, match="both ends of a needle of 9 mm"):
         measure_needle_length(images, found, 0.009, 0.0004)
     with pytest.raises(InvalidInputError, match="no needle's length in 5 frames"):

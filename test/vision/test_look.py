@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -71,3 +72,21 @@ def test_what_is_no_image_is_refused(image: np.ndarray):
         TRACKER.look(image)
     with pytest.raises(InvalidInputError, match="image"):
         VisionTracker(VisionTrackerSettings(), SCENE).track(image, 0.0)
+
+
+def test_a_given_view_by_which_the_dish_is_smaller_than_any_frame_finds_no_dish():
+    tiny = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=25.0 * PIXEL)
+    seen = VisionTracker(tiny, SCENE).look(render(Pose(np.array([0.003, -0.002]), 0.8)))
+    assert seen.view is not None
+    assert "correct metres_per_pixel" in seen.reason
+
+
+@pytest.mark.parametrize("region", [(), (40.0, 8.0, 632.0, 472.0)])
+def test_a_place_in_the_frame_of_a_tilted_camera_is_that_in_its_dish(region: tuple[float, ...]):
+    pose, straight = Pose(np.array([0.003, -0.002]), 0.8), np.array([[1.05, 0, -8], [0, 1, 0], [1e-4, 2e-5, 1.0]])
+    tilted = cv2.warpPerspective(render(pose), np.linalg.inv(straight), (640, 480), borderMode=cv2.BORDER_REPLICATE)
+    given = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=PIXEL, region_px=region)
+    seen = VisionTracker(replace(given, straightening=tuple(straight.ravel().tolist())), SCENE).look(tilted)
+    tip = np.linalg.inv(straight) @ [*VIEW.to_pixels(pose.at(1.0)), 1.0]
+    assert seen.place_of(tip[:2] / tip[2]) == pytest.approx(pose.at(1.0), abs=1e-3 * PIXEL)
+    assert np.linalg.norm(seen.tip - pose.at(1.0)) < 2.0 * PIXEL

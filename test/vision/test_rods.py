@@ -1,9 +1,9 @@
-"""Needles without a thread, blunt or rounded at both ends: their axis is found, their direction is never guessed."""
+"""Needles that are blunt or rounded at both ends: their axis is found, their direction is never guessed."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -153,3 +153,88 @@ def test_a_point_is_of_its_time():
     for time, until, reason in ((2.0, 1.9, UNDIRECTED), (2.1, 2.2, "a needle seen in 1 of 3 frames")):
         tracker.point_at_tip(view.to_dish(ends[1]), until)
         assert tracker.track(image, time).reason == reason
+
+
+def with_line(image: np.ndarray, ends: np.ndarray, length: float, *, beyond: float = 0.0) -> np.ndarray:
+    """Return a picture with a winding dark line of a length that leaves the first end of a rod [px].
+
+    `beyond` is how far it goes on under the rod and out of its other end, as a line drawn on the floor does.
+    """
+    back = (ends[0] - ends[1]) / math.dist(*ends)
+    along = np.arange(0.0, length, 1.0)
+    angle = math.atan2(back[1], back[0]) + 0.5 * np.sin(along / 25.0)
+    line = ends[0] + np.cumsum(np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)
+    if beyond:
+        line = np.vstack([(ends[1] - beyond * back)[None], ends[0][None], line])
+    drawn = np.full_like(image, 255)
+    cv2.polylines(drawn, [np.round(line * 16.0).astype(np.int32)], False, 110, 2, cv2.LINE_AA, 4)
+    return np.minimum(image, cv2.GaussianBlur(drawn, (0, 0), 0.7))
+
+
+@pytest.mark.parametrize("length", [60.0, 120.0])
+@pytest.mark.parametrize("end", [0, 1])
+def test_a_person_tells_the_tip_of_a_rod_that_a_line_leaves(length: float, end: int):
+    image, ends, tracker, view = rod_in_view()
+    way = ends if end else ends[::-1]
+    tracker.point_at_tip(view.to_dish(way[1]))
+    seen = [tracker.track(with_line(image, ends, length), 0.03 * index) for index in range(4)]
+    assert seen[-1].state is State.TRACKED
+    assert is_along(seen[-1], way)
+
+
+def test_a_point_tells_no_direction_once_the_needle_is_forgotten():
+    _, ends, tracker, view = rod_in_view()
+    tracker.point_at_tip(view.to_dish(ends[1]))
+    frames = [Rod(4, turned=1e-6 * index).drawn()[0] for index in range(4)]
+    assert [tracker.track(frame, index / RATE) for index, frame in enumerate(frames)][-1].state is State.TRACKED
+    assert [tracker.track(frame, 20.0 + index / RATE).reason for index, frame in enumerate(frames)] == [UNDIRECTED] * 4
+
+
+@pytest.mark.parametrize("seed", [3, 5, 6])
+def test_a_line_that_leaves_one_end_tells_the_direction_only_if_it_is_the_whole_thread(seed: int):
+    image, ends, told = Rod(seed).drawn()
+    view = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(image).view
+    assert view is not None
+    thread = 120.0 * view.metres_per_pixel
+    tracker = VisionTracker(replace(told, thread_length=thread), Scene(dish=Dish(DIAMETER)))
+    own = tracker.look(with_line(image, ends, 120.0))
+    assert own.state is State.TRACKED
+    assert is_along(own, ends)
+    for length, beyond in ((170.0, 0.0), (70.0, 0.0), (120.0, 30.0)):
+        seen = tracker.look(with_line(image, ends, length, beyond=beyond))
+        assert seen.reason == UNDIRECTED
+        assert is_along(seen, ends) or is_along(seen, ends[::-1])
+
+
+def test_each_frame_that_confirms_a_direction_must_tell_it_itself():
+    image, ends, told = Rod(4).drawn()
+    view = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(image).view
+    assert view is not None
+    tracker = VisionTracker(replace(told, thread_length=120.0 * view.metres_per_pixel), Scene(dish=Dish(DIAMETER)))
+    threaded = with_line(image, ends, 120.0)
+    reasons = [
+        tracker.track(frame, index / RATE).reason for index, frame in enumerate([threaded, image, image, threaded])
+    ]
+    assert reasons == ["a needle seen in 1 of 3 frames", UNDIRECTED, UNDIRECTED, "a needle seen in 2 of 3 frames"]
+    assert tracker.track(threaded, 4 / RATE).state is State.TRACKED
+    assert tracker.track(image, 5 / RATE).state is State.TRACKED  # the tracked past tells it from now on
+
+
+def test_a_rod_of_which_a_bright_mark_hides_a_corner_has_no_direction_with_any_size_near_its_own():
+    found = 0
+    for seed in range(8):
+        image, ends, told = Rod(seed, share=0.035).drawn()
+        width = told.needle_width / 0.95 / DIAMETER * 400.0  # px, about
+        ahead = (ends[1] - ends[0]) / math.dist(*ends)
+        aside = np.array([-ahead[1], ahead[0]])
+        corner = ends[1] + 0.5 * width * aside
+        far, near = corner + 2.0 * (ahead + aside), corner - 0.6 * width * ahead
+        mark = np.array([far, near + 2.0 * aside, near, corner - 0.35 * width * aside + 2.0 * ahead])
+        cv2.fillPoly(image, [np.round(mark * 16.0).astype(np.int32)], float(np.median(image)), cv2.LINE_AA, 4)
+        for off in (0.95, 1.05):
+            length, width_off = off * told.needle_length, (2.0 - off) * told.needle_width
+            off_size = replace(told, needle_length=length, needle_width=width_off)
+            seen = VisionTracker(off_size, Scene(dish=Dish(DIAMETER))).look(image)
+            assert seen.state is not State.TRACKED
+            found += len(seen.axis) > 0
+    assert found >= 14
