@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.bridge import BridgeOutput
 from magnetosuture_thread.estimator.thread_session import PredictionResult
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.closed_loop import Measurement
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.rig.setups import Setup
@@ -28,9 +29,9 @@ class PathControl:
     def __init__(self, setup: Setup) -> None:
         self._follower, self.done = setup.follower.follower(), False
 
-    def __call__(self, stamp: float, tail: Points, heading: Points, condition: object) -> Vector:
+    def __call__(self, stamp: float, tail: Points, heading: Points, condition: ThreadCondition) -> Vector:
         """Return the velocity for a measured pose, shape (2,) [m/s]."""
-        command = self._follower.compute_command(stamp, tail, heading)
+        command = self._follower.compute_command(stamp, tail, heading, condition.age)
         self.done = command.progress >= 1.0
         return np.asarray(command.velocity)
 

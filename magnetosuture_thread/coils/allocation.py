@@ -1,13 +1,10 @@
-"""Coil currents for a velocity of the needle: bounded least squares, certified by the safety filter.
-
-The gain of each coil against its calibration is estimated from the direction in which the needle lies.
-"""
+"""Coil currents for a velocity of the needle: bounded least squares, certified by the safety filter."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +16,7 @@ from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist
 
 Vector = NDArray[np.float64]
+Certificate = Callable[["Allocation"], tuple[float, str]]
 
 # Weights of the least-squares objectives; that of velocity and drift, which cannot be avoided everywhere, is 1.
 # The aligning field's own gradient pulls across the needle: at headings close to a coil's axis both cannot be had, and
@@ -34,15 +32,13 @@ HEADING_ERROR = 0.006  # rad; of a needle's measured pose
 # there, and is thrown farther.
 ERROR_GROWTH, MAX_HEADING_ERROR = 30.0, 0.2
 HEADING_STEP = 0.01  # rad; for the derivative by the heading
-COIL_ERROR = 0.025  # of a coil's field, with its gain estimated
+COIL_ERROR = 0.015  # of a coil's field, with its gain estimated: in some seconds, by a needle that is driven
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
+FIELD_ROUNDS, FIELD_TOLERANCE = 6, 0.03  # solutions, until the field along the needle is known to this share
+LEAST_FIELD = 1e-6  # T; in a weaker one the needle is turned by its torque alone
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
-GAIN_DEVIATION = 0.05  # of a calibrated coil
-MAX_CHANGE = 0.2  # of a gain
-DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
 DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and of its shape against a straight one
-TORQUE_TIME = 1.0  # s; in which the thread's torque on the needle changes, as a thread is led around a turn
 BISECTIONS = 7  # of the certified share: to 1 %, and never beyond it
 
 
@@ -58,6 +54,7 @@ class NeedleMechanics:
         drag_across: the same across the body [N s/m].
         turning_drag: torque for one rad/s [N m s].
         slack_drag: drag along the body while the thread is slack and adds nothing [N s/m].
+        max_pull: greatest force of the thread that is compensated [N].
     """
 
     length: float
@@ -67,6 +64,7 @@ class NeedleMechanics:
     drag_across: float
     turning_drag: float
     slack_drag: float
+    max_pull: float = math.inf
 
     @cached_property
     def kinematics(self) -> NeedleKinematics:
@@ -77,6 +75,11 @@ class NeedleMechanics:
     def chord(self) -> float:
         """Distance from tail to tip [m]."""
         return self.kinematics.chord
+
+    @property
+    def max_pull_speed(self) -> float:
+        """Greatest velocity that the thread's pull gives the needle [m/s]."""
+        return self.max_pull / self.slack_drag
 
     @property
     def pole(self) -> float:
@@ -104,21 +107,6 @@ class Allocation:
     saturated: bool
     drift: float = 0.0
 
-    def scaled(self, share: float) -> Allocation:
-        """Return the allocation scaled by a factor; the velocity is linear in the currents."""
-        if share == 1.0:
-            return self
-        return Allocation(share * self.currents, share * self.velocity, self.saturated, share * self.drift)
-
-    def towards(self, other: Allocation, share: float) -> Allocation:
-        """Return the allocation that has gone a share of the way to another."""
-        return Allocation(
-            self.currents + share * (other.currents - self.currents),
-            self.velocity + share * (other.velocity - self.velocity),
-            other.saturated,
-            self.drift + share * (other.drift - self.drift),
-        )
-
 
 class CoilAllocation:
     """Allocates coil currents for a velocity of the needle's tip.
@@ -128,13 +116,22 @@ class CoilAllocation:
     poles -q, +q at tail and tip and q = m / length, the currents give the tip the velocity
 
         v . e = F . e / drag                                  F = q (B_tip - B_tail)
-        v . n = F . n / drag_across + omega l / 2             omega = q l B . n / turning_drag
+        v . n = F . n / drag_across + omega l / 2             omega = (1 - exp(-T / tau)) (B . n - b) / (B . e T)
 
-    with the mean field B of both ends. They are the bounded least-squares solution of: the velocities along and across
-    by force, and the turn rate, as wanted; a field B_0 along the needle, which holds its direction; and little current.
-    What errors of the coils (`COIL_ERROR`) and of the heading would do to drift and direction counts too; that of the
-    heading is min(`HEADING_ERROR` exp(`ERROR_GROWTH` age), `MAX_HEADING_ERROR`), as a needle against a pull is in an
-    unstable balance close to a coil's axis. The field along the needle may fall to `MIN_ALIGNING_SHARE` B_0, not below.
+    with the mean field B of both ends, which lasts for the period T, the field b that balances the torque of the
+    thread, and tau = turning_drag / (q l B . e), in which the needle turns towards them. They are the bounded
+    least-squares solution of: the velocities along and across by force, and the turn rate, as wanted; a field B_0 along
+    the needle, which holds its direction; and little current. The field along the needle may fall to
+    `MIN_ALIGNING_SHARE` B_0, not below.
+
+    What errors of the coils (`COIL_ERROR`) and of the heading would do to drift and direction counts too. The deviation
+    of the heading is
+
+        hypot(min(`HEADING_ERROR` exp(`ERROR_GROWTH` age), `MAX_HEADING_ERROR`), `COIL_ERROR` |a| / (B . e))
+
+    with the field a of each coil across the needle: close to a coil's axis large fields cancel each other there, and a
+    needle against a pull is in an unstable balance. B . e and a are those of the solution before, from that of the last
+    currents on.
 
     Source: none.
 
@@ -143,13 +140,17 @@ class CoilAllocation:
         needle: its mechanics.
         aligning_field: B_0 [T].
         max_current: in either direction [A].
+        period: T, for which currents last [s].
 
     Attributes:
+        response_time: T / (1 - exp(-T / tau)) with B . e = B_0, in which a needle turns by its angle to the field [s].
         names: of the coils, in the order of their currents.
         gains: by which factor each coil's field differs from its calibration, shape (m,); 1 until something is known.
     """
 
-    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
+    def __init__(
+        self, coils: LoopCoils, needle: NeedleMechanics, aligning_field: float, max_current: float, period: float = 0.0
+    ) -> None:
         # Here, so that it delays no command, and nobody who reads settings alone.
         from scipy.optimize import lsq_linear
 
@@ -160,6 +161,24 @@ class CoilAllocation:
         self._field = aligning_field
         self._max_current = max_current
         self.gains = np.ones(len(self.names))
+        self._period = period
+        self.response_time = self._response(aligning_field) / aligning_field
+
+    def _response(self, field: float) -> float:
+        """Return the field across the needle by which it turns, in a field along it [T], for 1 rad/s [T s]."""
+        slow = self._needle.turning_drag / (self._needle.pole * self._needle.chord)
+        return self._period * field / -math.expm1(-self._period * field / slow) if self._period else slow
+
+    @staticmethod
+    def _doubt(measured: float, across: Vector, field: float) -> float:
+        """Return the deviation of the heading [rad].
+
+        Args:
+            measured: of the measured heading [rad].
+            across: field of each coil across the needle, shape (m,) [T], with an error of `COIL_ERROR`.
+            field: along it [T].
+        """
+        return math.hypot(measured, COIL_ERROR * float(np.linalg.norm(across)) / field)
 
     def slack_speed(self, allocation: Allocation, heading: Vector) -> float:
         """Return the speed that the force of allocated currents gives a needle that lies along it, with a slack thread.
@@ -189,6 +208,7 @@ class CoilAllocation:
         max_change: float = math.inf,
         age: float = 0.0,
         *,
+        balance: float = 0.0,
         at_tip: bool = False,
     ) -> Allocation:
         """Return the currents for a motion of the needle; for none, those that hold its direction.
@@ -200,6 +220,7 @@ class CoilAllocation:
             previous: currents of the last step, shape (m,) [A]; no limit on change if None.
             max_change: maximum change of each current [A].
             age: time since the pose was measured [s].
+            balance: b, to the needle's left [T].
             at_tip: whether the tip is to move as it would by that motion: then the needle turns against what the
                 currents add across it, and errors do not count. Else it turns as commanded.
         """
@@ -209,51 +230,71 @@ class CoilAllocation:
         lever = 0.5 * needle.chord
         middle = tail + lever * e
         along, across, across_field, along_field = self._rows(middle, e)
-        turning = lever * needle.pole * needle.chord / needle.turning_drag * across_field
-        # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
-        max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
-        turned = min(max_turn_speed, max(-max_turn_speed, lever * twist.turn_rate))
         # From the field at one pole alone: velocities count by the force that they take.
         along_speed, across_speed = (needle.pole * self._field / drag for drag in (needle.drag, needle.drag_across))
-        turn_weight = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
         # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
         # the needle takes large currents whose fields cancel each other, and their errors do not.
         swung = lever / CORRECTION_TIME * across_field / (MIN_ALIGNING_SHARE * self._field)
         effort = np.hypot(CURRENT_WEIGHT / self._max_current, COIL_ERROR / across_speed * np.hypot(across, swung))
         # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
         growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
-        beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
-        misaligned = HEADING_ERROR * math.exp(growth) / HEADING_STEP * (self._rows(middle, beside)[1] - across)
+        measured, beside = HEADING_ERROR * math.exp(growth), math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
+        misaligned = (self._rows(middle, beside)[1] - across) / (HEADING_STEP * across_speed)
         if at_tip:  # a drift by such an error is corrected by the turn, as any other
             effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
         system = np.vstack(
             [
                 along / along_speed,
-                turn_weight * (turning + across if at_tip else turning),
+                np.zeros(len(self.names)),
                 ALIGN_WEIGHT / self._field * along_field,
                 across / across_speed,
-                misaligned / across_speed,
+                np.zeros(len(self.names)),
                 np.diag(effort),
             ]
         )
         target = np.zeros(len(system))
-        target[:4] = twist.along / along_speed, turn_weight * turned, ALIGN_WEIGHT, twist.across / across_speed
+        target[:4] = twist.along / along_speed, 0.0, ALIGN_WEIGHT, twist.across / across_speed
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
             lower, upper = (np.clip(previous + change, -limit, limit) for change in (-max_change, max_change))
-        currents = self._bounded_least_squares(system, target, lower, upper)
-        if along_field @ currents < MIN_ALIGNING_SHARE * self._field:
-            # A constraint that the optimum violates is active in the constrained optimum.
-            system[2] = CONSTRAINT_WEIGHT / self._field * along_field
-            target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
+        field, least = self._field, MIN_ALIGNING_SHARE * self._field
+        doubt = measured
+        if previous is not None and previous.any():  # from which what is looked for is not far
+            field = max(float(along_field @ previous), least)
+            doubt = self._doubt(measured, across_field * previous, field)
+        for _ in range(FIELD_ROUNDS):
+            system[4] = doubt * misaligned
+            response = self._response(field)
+            turning, torque = lever / response * across_field, lever / response * balance
+            # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
+            max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * field / response
+            turned = min(max_turn_speed, max(-max_turn_speed, lever * twist.turn_rate + torque))
+            turn_weight = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
+            system[1] = turn_weight * (turning + across if at_tip else turning)
+            target[1] = turn_weight * turned
             currents = self._bounded_least_squares(system, target, lower, upper)
-        drift = float(across @ currents)
-        reached = float(along @ currents) * e + (float(turning @ currents) + drift) * n
+            if along_field @ currents < least:
+                # A constraint that the optimum violates is active in the constrained optimum.
+                system[2] = CONSTRAINT_WEIGHT / self._field * along_field
+                target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
+                currents = self._bounded_least_squares(system, target, lower, upper)
+            before, field = field, max(float(along_field @ currents), least)
+            last, doubt = doubt, math.sqrt(doubt * self._doubt(measured, across_field * currents, field))
+            if max(abs(field - before) / before, abs(doubt - last) / last) <= FIELD_TOLERANCE:
+                break
+        found = self.motion(currents, tail, heading, balance)
         wanted = twist.along * e + (lever * twist.turn_rate + twist.across) * n
-        inaccurate = math.hypot(*(reached - wanted)) > SATURATION_TOLERANCE * math.hypot(*wanted)
-        saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
-        return Allocation(currents, reached, saturated, drift)
+        inaccurate = math.hypot(*(found.velocity - wanted)) > SATURATION_TOLERANCE * math.hypot(*wanted)
+        return replace(found, saturated=inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit)))
+
+    def motion(self, currents: Vector, tail: Vector, heading: Vector, balance: float = 0.0) -> Allocation:
+        """Return currents, shape (m,) [A], with the motion that they give the needle; see `allocate`."""
+        e = self._needle.chord_direction(heading)
+        lever, n = 0.5 * self._needle.chord, np.array([-e[1], e[0]])
+        along, drift, across_field, field = (self._rows(tail + lever * e, e) @ currents).tolist()
+        swing = lever * (across_field - balance) / self._response(max(field, LEAST_FIELD))
+        return Allocation(currents, along * e + (swing + drift) * n, False, drift)
 
     def _rows(self, middle: Vector, e: Vector) -> Vector:
         """Return what one ampere in each coil gives a needle with its chord along e, shape (4, m).
@@ -313,101 +354,6 @@ class CoilAllocation:
         return np.clip(self._solve_bounded(system, target, bounds=bounds, method="bvls").x, lower, upper)
 
 
-class CoilGainEstimator:
-    """Estimates by which factor each coil's field differs from its calibration.
-
-    The needle's magnetic moment m turns towards the field, against the liquid and the thread. With the unit vector n
-    across its chord, the currents I, the calibrated field b_i of one ampere in coil i, the turning drag c, the rate
-    omega at which the poses turn and the thread's torque T,
-
-        n . sum_i g_i b_i I_i = (c omega + T) / m + noise,    of deviation DIRECTION_DEVIATION |B|
-
-    A Kalman filter takes this at each measured pose. Its state is the gains g, 1 with GAIN_DEVIATION at first, and
-    T / m, which is forgotten in TORQUE_TIME. The deviation of T is what a straight thread of drag k gives that is
-    pulled aside at the needle's speed v, k v l / 2 with the chord l. A factor on all gains does not show in the
-    direction: their mean stays 1.
-
-    Source: the extended Kalman filter. Deviation: the gains are scaled to their mean after each measurement, their
-    covariance is not. Pure: times come in, in seconds.
-
-    Args:
-        coils: their calibrated field.
-        needle: its mechanics.
-        thread_drag: k, of a straight thread behind the needle [N s/m].
-    """
-
-    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, thread_drag: float) -> None:
-        self._coils, self._needle = coils, needle
-        count = len(coils.names)
-        self._state = np.append(np.ones(count), 0.0)  # gains, and the field that balances the thread's torque [T]
-        self._field_per_speed = 0.5 * needle.chord * thread_drag / needle.moment  # that balances the torque [T s/m]
-        self._covariance = np.diag([GAIN_DEVIATION**2] * count + [0.0])
-        self._applied: deque[tuple[float, Vector]] = deque()
-        self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
-
-    @property
-    def gains(self) -> Vector:
-        """The factors, shape (m,)."""
-        return self._state[:-1]
-
-    def apply(self, now: float, currents: Vector) -> None:
-        """Register the currents from a time of the stamps' clock on, shape (m,) [A]."""
-        if self._applied and now < self._applied[-1][0]:  # time was set back
-            self._applied.clear()
-        self._applied.append((now, currents))
-
-    def stop(self) -> None:
-        """Register that the currents are zero: nothing holds the needle's direction."""
-        self._applied.clear()
-
-    def update(self, tail: Vector, heading: Vector, stamp: float) -> None:
-        """Take a measured pose.
-
-        Args:
-            tail: shape (2,) [m].
-            heading: unit vector at the tail, shape (2,).
-            stamp: when it was measured [s].
-        """
-        e = self._needle.chord_direction(heading)
-        middle = tail + 0.5 * self._needle.chord * e
-        last, self._last = self._last, (stamp, middle, e)
-        if last is None or stamp <= last[0]:
-            return
-        interval = stamp - last[0]
-        self._predict(interval, math.hypot(*(middle - last[1])) / interval)
-        while len(self._applied) > 1 and self._applied[1][0] <= stamp:
-            self._applied.popleft()
-        if not self._applied or self._applied[0][0] > stamp or not self._applied[0][1].any():
-            return
-        currents = self._applied[0][1]
-        chord = self._needle.chord * e
-        fields = 0.5 * (self._coils.per_current(tail) + self._coils.per_current(tail + chord)) * currents
-        row = np.append(fields[1] * e[0] - fields[0] * e[1], -1.0)
-        before = last[2]
-        turned = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
-        turning = self._needle.turning_drag / self._needle.moment / interval  # field for one radian in the interval
-        size = float(np.linalg.norm(fields @ self.gains))
-        deviation = math.hypot(DIRECTION_DEVIATION * size, HEADING_ERROR * turning)
-        spread = self._covariance @ row
-        variance = float(row @ spread) + deviation**2
-        residual = turning * turned - float(row @ self._state)
-        if residual**2 > 16.0 * variance:  # four standard deviations: the needle is held by something
-            return
-        self._state = self._state + spread * (residual / variance)
-        gains = self.gains
-        self._state[:-1] = np.clip(gains / gains.mean(), 1.0 - MAX_CHANGE, 1.0 + MAX_CHANGE)
-        self._covariance -= np.outer(spread, spread) / variance
-
-    def _predict(self, interval: float, speed: float) -> None:
-        """Let the gains drift and the thread's torque be forgotten over an interval [s], at a speed [m/s]."""
-        kept = math.exp(-interval / TORQUE_TIME)
-        self._state[-1] *= kept
-        self._covariance[-1] *= kept
-        self._covariance[:, -1] *= kept
-        self._covariance[-1, -1] += (1.0 - kept**2) * (self._field_per_speed * speed) ** 2
-        self._covariance[:-1, :-1] += DRIFT_DEVIATION**2 * min(1.0, interval) * np.eye(len(self.gains))
-
-
 class CertifiedAllocation:
     """Allocates currents for a motion of the needle against a pull, as far as that is certified for the hold time.
 
@@ -418,13 +364,17 @@ class CertifiedAllocation:
     Where even I_hold is not, as no currents keep the needle there, I - I_hold is certified by itself, and so are then
     all currents: else the needle could not be turned to where there are. Without a pull I_hold is zero.
 
+    Their force gives a needle with a slack thread at most `max_speed`, and against a pull at most the speed that is
+    wanted and `max_pull_speed` more, whatever that pull is said to be.
+
     Args:
         coils: allocate the currents.
         max_speed: of the needle by the force of the currents, with a slack thread [m/s].
+        max_pull_speed: see `NeedleMechanics` [m/s].
     """
 
-    def __init__(self, coils: CoilAllocation, max_speed: float) -> None:
-        self._coils, self._max_speed = coils, max_speed
+    def __init__(self, coils: CoilAllocation, max_speed: float, max_pull_speed: float = math.inf) -> None:
+        self._coils, self._max_speed, self._max_pull_speed = coils, max_speed, max_pull_speed
 
     def allocate(
         self,
@@ -434,6 +384,7 @@ class CertifiedAllocation:
         previous: Allocation,
         max_change: float,
         pull: NeedleTwist | None,
+        balance: float = 0.0,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.
 
@@ -444,16 +395,24 @@ class CertifiedAllocation:
             previous: of the last step.
             max_change: maximum change of each current [A].
             pull: motion that something else gives the needle; None where that is not measured.
+            balance: of the torque that something else gives it, see `CoilAllocation` [T].
         """
         at = pose.tail, pose.heading
+
+        def moved(currents: Vector, of: Allocation) -> Allocation:
+            return replace(self._coils.motion(currents, *at, balance), saturated=of.saturated)
 
         def allocated(wanted: NeedleTwist) -> tuple[Allocation, str]:
             against = wanted if pull is None else wanted.less(pull)
             allocation = self._coils.allocate(
-                against, *at, previous.currents, max_change, pose.age, at_tip=pull is None
+                against, *at, previous.currents, max_change, pose.age, balance=balance, at_tip=pull is None
             )
-            speed = self._coils.slack_speed(allocation, pose.heading)
-            return (allocation.scaled(self._max_speed / speed), SPEED) if speed > self._max_speed else (allocation, "")
+            speed, limit = self._coils.slack_speed(allocation, pose.heading), self._max_speed
+            if pull is not None:
+                limit = min(limit, math.hypot(wanted.along, wanted.across) + self._max_pull_speed)
+            if speed <= limit:
+                return allocation, ""
+            return moved(limit / speed * allocation.currents, allocation), SPEED
 
         def certified(allocation: Allocation) -> tuple[float, str]:
             if pull is None:
@@ -461,21 +420,41 @@ class CertifiedAllocation:
             velocity = allocation.velocity + safety.kinematics.tip_velocity(pose.heading, pull)
             return safety.safe_share(velocity, *at, allocation.drift + pull.across)
 
+        def part(currents_of: Callable[[float], Vector], first: float, torque: float, by: Certificate) -> Allocation:
+            """Return the currents of the greatest share, up to a first one, whose motion is certified.
+
+            Without any such share they are those of none: zero, or the hold, which is certified.
+            """
+
+            def tried(share: float) -> Allocation:
+                return replace(self._coils.motion(currents_of(share), *at, torque), saturated=drive.saturated)
+
+            found = tried(first)
+            if by(found)[0] >= 1.0:
+                return found
+            low, high, found = 0.0, first, tried(0.0)
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                if by(one := tried(middle))[0] >= 1.0:
+                    low, found = middle, one
+                else:
+                    high = middle
+            return found
+
+        def by_itself(allocation: Allocation) -> tuple[float, str]:
+            return safety.safe_share(allocation.velocity, *at, allocation.drift if pull is not None else 0.0)
+
         drive, bound = allocated(twist)
         share, name = certified(drive)
         if share >= 1.0:
             return drive, bound
         if pull is None:
-            return drive.scaled(share), name
+            return part(lambda of: of * drive.currents, share, 0.0, by_itself), name
         hold, _ = allocated(NeedleTwist())
-        if certified(hold)[0] < 1.0:
-            added = drive.velocity - hold.velocity
-            kept = hold.towards(drive, safety.safe_share(added, *at, drive.drift - hold.drift)[0])
-            # The pull apart, these currents may not bring the needle too close: the hold is limited in its change too.
-            share, by_itself = safety.safe_share(kept.velocity, *at, kept.drift)
-            return kept.scaled(share), by_itself or name
-        low, high = 0.0, 1.0
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if certified(hold.towards(drive, middle))[0] >= 1.0 else (low, middle)
-        return hold.towards(drive, low), name
+        added = drive.currents - hold.currents
+        if certified(hold)[0] >= 1.0:
+            return part(lambda of: hold.currents + of * added, 1.0, balance, certified), name
+        # The pull and its torque apart, these currents may not bring the needle too close, nor may their change.
+        changed = hold.currents + part(lambda of: of * added, 1.0, 0.0, by_itself).currents
+        kept = part(lambda of: of * changed, 1.0, 0.0, by_itself)
+        return moved(kept.currents, drive), name

@@ -35,6 +35,7 @@ INPUTS = {OPERATOR: "operator/servo_cv", NEEDLE: "needle/servo_cv"}  # topics, b
 LOOKAHEAD_PERIODS = 2.0  # in which command and pose must stay valid: one to the next step, one to the boards
 SWIFT = 1e3  # m/s and rad/s; faster than anything, so that no product overflows
 MIN_JUDGED = 0.2  # s; poses that are no farther apart are judged, also by a bridge that takes none so old
+MAX_BLIND_TURN = 0.35  # rad; between two poses: of a crossing of a coil's axis, which ends also where poses get lost
 STILL = "a motion that leaves the tip where it is"
 NO_SCENE, NO_POSE = "no scene", "no needle pose"
 NO_PREDICTION, CURRENT_LIMIT = "no prediction", "current"  # constraints of the bridge, besides those of the filter
@@ -154,17 +155,18 @@ class CoilBridge:
             max_hold=settings.hold_time,
         )
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
-        self._observer = MotionObserver(
-            kinematics, self._hold, settings.max_speed, max(MIN_JUDGED, settings.pose_timeout)
-        )
+        self._observer = MotionObserver(kinematics, self._hold, min(settings.max_speed, needle.max_pull_speed))
         slack_ratio = needle.drag / needle.slack_drag
-        self._follow = FollowMonitor(settings.pose_uncertainty, slack_ratio)
-        self._settings, self._gains, self._allocation = settings, settings.gain_estimator(), settings.allocation()
-        self._coils = CertifiedAllocation(self._allocation, settings.max_speed)
+        max_interval = max(MIN_JUDGED, settings.pose_timeout)
+        self._follow = FollowMonitor(settings.pose_uncertainty, slack_ratio, max_interval)
+        self._settings, self._heading, self._allocation = settings, settings.heading_observer(), settings.allocation()
+        self._coils = CertifiedAllocation(self._allocation, settings.max_speed, needle.max_pull_speed)
         self._filter: NeedleSafetyFilter | None = None
         self._losses, self._previous, self._velocity = 0, self._allocation.zero(), np.zeros(2)
         self._last_step, self._was_armed, self._blocked, self._blocked_reason = -math.inf, False, -math.inf, ""
         self._stopped: float | None = None
+        self._pose_stamp = -math.inf
+        self._turned = 0.0  # by which the needle was turned since the last pose [rad]
         self.set_scene(scene)
 
     @property
@@ -196,6 +198,7 @@ class CoilBridge:
         """Register that the currents are zero from a time on; see `step` for the times."""
         self._clear()
         self._observer.rest(now)
+        self._heading.rest(now)
         self.extrapolator.apply_velocity(self._velocity, now, arrival)
 
     def command(self, source: str, command: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
@@ -227,20 +230,26 @@ class CoilBridge:
     ) -> None:
         """Register a measured needle pose; see `PoseExtrapolator.update`."""
         self.stamp_ages.add(TOPIC, now - stamp, arrival)
+        error = self._heading.stamp_error  # 0 without compensation
         try:
-            self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance, self.latch.armed)
+            self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance, self.latch.armed, error)
         except InvalidInputError:
             if self.latch.armed and self.extrapolator.rejections >= CONSISTENT_POSES:
                 self.latch.trip(f"needle does not follow: {self.extrapolator.rejection}")
             raise
-        motion = self._observer.update(tail, heading, stamp, self._follow.is_trusted(stamp))
+        deviation = 0.0
+        if stamp > self._pose_stamp:
+            self._turned = 0.0
+        self._pose_stamp = stamp
+        if self._settings.motion_compensation:
+            self._heading.update(heading, stamp)
+            self._allocation.gains, deviation = self._heading.gains, self._heading.stamp_deviation
+        seen = stamp - error
+        motion = self._observer.update(tail, heading, seen, self._follow.is_trusted(seen), deviation)
         if motion is not None and self.latch.armed and self._filter is not None:
             at_shape = self._filter.clearance(tail, heading) < self._filter.keep_out
             if problem := self._follow.update(motion, at_shape):
                 self.latch.trip(problem)
-        if self._settings.motion_compensation:
-            self._gains.update(tail, heading, stamp)
-            self._allocation.gains = self._gains.gains
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
         """Register the thread model's margins; see `PredictionMonitor.update`."""
@@ -284,8 +293,8 @@ class CoilBridge:
         self._clear()
         return self._output(_SelectedInput(), (reason,))
 
-    def _step(self, now: float, arrival: float, driver: DriverState) -> BridgeOutput:
-        period = 1.0 / self._settings.rate
+    def _begin_step(self, arrival: float, driver: DriverState) -> float:
+        """Latch what has happened to driver and loop since the step before; return the time since then [s]."""
         interval = arrival - self._last_step
         if self.latch.armed and not (driver.ready and driver.losses == self._losses):
             self.latch.trip(f"driver: {driver.problem or 'currents were lost for a moment'}")
@@ -295,12 +304,21 @@ class CoilBridge:
         self._last_step, self._was_armed = arrival, self.latch.armed
         if interval > self._hold:
             self._clear()  # the driver has gone to zero by itself
+        return interval
+
+    def _step(self, now: float, arrival: float, driver: DriverState) -> BridgeOutput:
+        period = 1.0 / self._settings.rate
+        interval = self._begin_step(arrival, driver)
         # However late a step is, velocity and currents change by at most that of two periods.
         elapsed = min(max(interval, 0.0), 2.0 * period)
         # An input that becomes stale before the next step has reached the boards is stale now.
         then = (now + LOOKAHEAD_PERIODS * period, arrival + LOOKAHEAD_PERIODS * period)
         selected = self._select_input(*then)
         pose = self.extrapolator.pose(now, arrival)
+        angle = self._heading.angle(now) if self._settings.motion_compensation else None
+        if pose is not None and angle is not None:
+            tail, direction = self._needle.kinematics.turned_to(pose.tail, pose.heading, angle)
+            pose = replace(pose, tail=tail, heading=direction)
         in_needle_frame, commanded = len(selected.command) == 3, NeedleTwist()
         if pose is not None and in_needle_frame:
             commanded = NeedleTwist(*np.clip(selected.command, -SWIFT, SWIFT).tolist())
@@ -359,8 +377,14 @@ class CoilBridge:
             twist = kinematics.twist(pose.heading, wanted)._replace(across=aside)
         if not compensates and not wanted.any():
             return self._zero_output(now, arrival, selected, (rest_reason(list(active) or [STILL]),), active, slowdown)
+        if compensates:
+            rate = max(0.0, MAX_BLIND_TURN - abs(self._turned)) / period
+            twist = twist._replace(turn_rate=min(rate, max(-rate, twist.turn_rate)))
         max_change = settings.max_current_slew * elapsed
-        allocation, limiting = self._coils.allocate(twist, pose, self._filter, self._previous, max_change, pull)
+        balance = 0.0 if pull is None else self._heading.balance(pull.across)
+        allocation, limiting = self._coils.allocate(
+            twist, pose, self._filter, self._previous, max_change, pull, balance
+        )
         limits = limiting, CURRENT_LIMIT if allocation.saturated else ""
         active += tuple(name for name in limits if name and name not in active)
         pulled = NeedleTwist() if pull is None else pull
@@ -376,16 +400,16 @@ class CoilBridge:
         self._previous, self._stopped = allocation, None
         self._velocity = expected if in_needle_frame else wanted
         self.extrapolator.apply_velocity(expected, now, arrival, own_drift + pulled.across)
-        given = kinematics.twist(pose.heading, allocation.velocity, own_drift)
+        self._heading.apply(now, pose.tail, pose.heading, allocation.currents, pulled.across)
+        motion = kinematics.twist(pose.heading, expected, own_drift + pulled.across)
         e = kinematics.chord_direction(pose.heading)
         n = np.array([-e[1], e[0]])
-        applied = given.along * e + own_drift * n
+        applied = (motion.along - pulled.along) * e + own_drift * n
         # Where the force that is allowed does not suffice, what was intended is the wanted velocity.
         intended = twist.along * e + twist.across * n if limiting == SPEED else applied + self._observer.velocity
-        self._observer.apply(now, applied, intended, given.turn_rate)
-        self._follow.register_turn(given.turn_rate * period)
-        if compensates:
-            self._gains.apply(now, allocation.currents)
+        self._observer.apply(now, applied, intended, motion.turn_rate)
+        self._follow.register_turn(motion.turn_rate * period)
+        self._turned += motion.turn_rate * period
         return self._output(selected, (), active, slowdown, self._observer.velocity if compensates else NO_VELOCITY)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
@@ -456,4 +480,3 @@ class CoilBridge:
     def _clear(self) -> None:
         """Restart the limits on change from zero current and velocity."""
         self._previous, self._velocity = self._allocation.zero(), np.zeros(2)
-        self._gains.stop()

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inner
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inner, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import EDGE_WIDTH, WorkspaceData, measure
 from magnetosuture_thread.geometry.polyline import Points
 
@@ -262,7 +262,7 @@ def _polygon_time(needle: PosedNeedle, i: int, s: int, vx: float, vy: float, ome
     return best
 
 
-@compiled
+@compiled_uncounted
 def safe_time(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.0) -> tuple[float, int, int]:
     """Return for how long a motion keeps the needle clear, at most `hold`, what ends it, and which point meets it.
 

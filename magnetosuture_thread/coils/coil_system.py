@@ -6,6 +6,7 @@ import math
 import sys
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -78,13 +79,19 @@ class CoilSystem:
         self.closed = UNCONFIGURED
         self._record = record
         self.driver_name = "none"
-        self._auto_arm = False
+        self._auto_arm, self._max_timeout = False, 0.0
         self._imported: tuple[str, ...] = ()
 
     @property
     def driver_state(self) -> DriverState:
-        """State of the driver."""
-        return DriverState(False, self.closed) if self.bridge is None or self.driver is None else self.driver.state()
+        """State of the driver; one that may hold currents for longer than motion is certified for is not ready."""
+        if self.bridge is None or self.driver is None:
+            return DriverState(False, self.closed)
+        state = self.driver.state()
+        if not state.ready or state.timeout <= self._max_timeout:
+            return state
+        expected = f"expected at most driver_timeout, {self._max_timeout:g} s"
+        return replace(state, ready=False, problem=f"it stops by itself after {state.timeout:g} s, {expected}")
 
     @property
     def closed_reasons(self) -> tuple[str, ...]:
@@ -140,7 +147,14 @@ class CoilSystem:
                 raise ConfigurationError(where, name, "one that was named when the node started")
 
     def open(self, settings: CoilBridgeSettings, bridge: CoilBridge, driver: CoilDriver) -> None:
-        """Open a driver; from now on each step applies currents, zero at first."""
+        """Open a driver; from now on each step applies currents, zero at first.
+
+        Raises:
+            ConfigurationError: the bridge would arm itself with a driver that may move something.
+        """
+        if settings.autostart == "armed" and not getattr(driver, "moves_nothing", False):
+            raise settings.refused("autostart", "active at most: what may move something is armed by a person")
+        self._max_timeout = math.inf if getattr(driver, "moves_nothing", False) else settings.driver_timeout
         self.driver, self.driver_name = driver, settings.driver
         driver.open()
         self.bridge, self.timing = bridge, LoopTiming(1.0 / settings.rate)
@@ -218,7 +232,7 @@ class CoilSystem:
         """
         if self.bridge is None or self.driver is None:
             return None
-        state = self.driver.state()
+        state = self.driver_state
         self._auto_arm = self._auto_arm and self.latch.ready_to_arm
         if self._auto_arm and state.ready and self.bridge.scene is not None:
             try:

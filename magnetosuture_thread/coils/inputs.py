@@ -345,6 +345,7 @@ class PoseExtrapolator:
         self._check = InputCheck(TOPIC, timeout)
         self._arrival = -math.inf  # of the last accepted one
         self._accepted: _Measured | None = None
+        self._late = 0.0  # by how much it is older than its stamp [s]
         self.rejection = ""
         self._candidate: _Measured | None = None
         self._consistent = 0  # consecutive consistent poses
@@ -366,6 +367,7 @@ class PoseExtrapolator:
         arrival: float,
         covariance: Vector | None = None,
         armed: bool = False,
+        stamp_error: float = 0.0,
     ) -> None:
         """Register a measured pose.
 
@@ -378,6 +380,8 @@ class PoseExtrapolator:
             arrival: a monotonic clock now [s].
             covariance: of x, y and the heading's angle, shape (3, 3) [m, m, rad]; None where it is not known.
             armed: whether the needle may be moved.
+            stamp_error: by how much the stamp is later than the pose was measured, as estimated [s]. The pose is
+                extrapolated from then, and counts as old as the older of both; what is refused goes by the stamp.
 
         Raises:
             InvalidInputError: the pose is not finite, too old, from the future, older than the last one, not
@@ -397,7 +401,8 @@ class PoseExtrapolator:
             raise InvalidInputError(TOPIC, "a pose from a stall of the loop", "one after the coils have stopped")
         self._accepted, self._arrival = measured, arrival
         # A stamp slightly in the future, as clocks differ, counts as now.
-        self._extrapolated, self._until = Pose(tail, heading), min(stamp, now)
+        self._extrapolated, self._until = Pose(tail, heading), min(stamp - stamp_error, now)
+        self._late = max(0.0, stamp_error)
         if self._history:  # before the first velocity kept the needle was at rest
             self._until = max(self._until, min(self._history[0][0], now))
         times = [since for since, _ in self._history][1:]
@@ -415,7 +420,7 @@ class PoseExtrapolator:
             return f"needle pose rejected: {self.rejection}"
         if self._accepted is None:
             return "no needle pose yet"
-        if max(arrival - self._arrival, now - self._accepted.stamp) > self._timeout:
+        if max(arrival - self._arrival, now - self._accepted.stamp + self._late) > self._timeout:
             return f"no needle pose for {self._timeout:g} s"
         return "no needle pose since the loop stalled" if self._extrapolated is None else ""
 
@@ -448,7 +453,9 @@ class PoseExtrapolator:
             return None
         self._extrapolate(self._velocity, now)
         # By the worse of both, as `stale_reason`: the stamps' clock may be ahead, or be set back.
-        return replace(self._extrapolated, age=max(0.0, now - self._accepted.stamp, arrival - self._arrival))
+        return replace(
+            self._extrapolated, age=max(0.0, now - self._accepted.stamp + self._late, arrival - self._arrival)
+        )
 
     def _check_plausible(self, measured: _Measured, armed: bool) -> None:
         """Reject an implausible pose; see the class."""

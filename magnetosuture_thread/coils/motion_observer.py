@@ -22,14 +22,23 @@ MIN_WINDOW = 0.15  # s; three poses of 20 a second, in which a pull that has cha
 MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
 MIN_DISTANCE = 2e-4  # m; ten times the noise of a measured pose
 SHAPE_FACTOR = 4.0  # on that, for a needle at wall or shape: 2 mm with the default pose_uncertainty
+VISIBLE_TURN = 0.03  # rad; four times the noise of a turn between two poses
+MAX_UNSEEN = 1.5e-3  # m; a thread that tightens holds a needle against less, in simulated procedures against 1 mm
+MAX_UNSEEN_TURN = 0.5  # rad; more than the bridge turns a needle between two poses, also by stamps that are wrong
 MIN_SHARE = 0.1  # of the expected motion, in its direction, that a needle which follows makes at least
 STILL_SHARE = 0.7  # of the expected motion; a needle that is held, and pulled by its thread, moves less
+MAX_INNOVATION = 9.0  # mean square of innovations over their variance: three deviations; in simulated runs up to 2.4
+MIN_INNOVATIONS = 3  # poses over which that is taken
+STAMP_DEVIATIONS = 2.0  # by which stamps may be off there: poses in a row by the same, which does not average out
 MAX_TURN = 1.0  # rad; the field's torque keeps a needle nearer to its direction, against any thread
-PROBE_TURN, PROBE_RATE = 0.2, 4.0  # rad, forty times the noise of a heading, and rad/s
-PROBE_SHARE = 0.2  # of a turn of the field, which the needle makes at least
+PROBE_TURN, PROBE_RATE = 0.1, 4.0  # rad, twenty times the noise of a heading, and rad/s
+PROBE_SHARE = 0.5  # of a turn of the field, which the needle makes at least
 PROBE_TIMEOUT = 0.4  # s; a needle that could not be turned by then does not follow
 TRUST_TIME = 1.0  # s after a probe that the needle has followed
 MAX_ERROR, MAX_ERROR_SHARE = 2.0, 0.8  # of d and of the expected displacement, while a pull is learnt that has changed
+
+NO_MOTION: Vector = np.zeros(2)
+NO_MOTION.flags.writeable = False  # shared by all steps without one
 
 
 class MotionObserver:
@@ -38,15 +47,17 @@ class MotionObserver:
     A Kalman filter of the place p of the chord's middle and of that velocity d, in the dish's frame. Between two poses,
     T apart, with the mean c of the velocity by the currents,
 
-        p' = p + T (c + d),    d' = d + noise,    var = PULL_NOISE T;    p is measured with PLACE_DEVIATION
+        p' = p + T (c + d),    d' = d + noise,    var = PULL_NOISE T
 
-    d is at most `max_speed`. The coils compensate d: for the motion u they are set to c = u - d. Where the needle moves
-    at k c, d converges with poses up to 0.4 s late for k from 0.5 to 1.5, so the drag of the model is the needle's own:
-    that of the thread is a part of the pull.
+    p is measured with the variance PLACE_DEVIATION^2 + x^2, where x is half of the difference of T c between the
+    intervals one deviation of the stamps earlier and later.
+    d is at most `max_speed`, by the force that a thread can have. The coils compensate d: for the motion u they are set
+    to c = u - d. Where the needle moves at k c, d converges with poses up to 0.4 s late for k from 0.5 to 1.5, so the
+    drag of the model is the needle's own: that of the thread is a part of the pull.
 
-    It learns only from motion that can be seen: a pose counts once the middle has moved by `VISIBLE` since the last one
-    that did, or while no currents are on, or while the needle is trusted to be tracked. Poses that stand still thus
-    wind up nothing.
+    What makes |d| smaller counts at once. What makes it greater counts only if it can be seen: once the middle has
+    moved by `VISIBLE` since the last pose that counted, or while no currents are on, or while the needle is trusted to
+    be tracked. Poses that stand still thus wind up nothing.
 
     Source: the Kalman filter of a constant disturbance. Deviation: d is bounded. Pure: times come in, in seconds.
 
@@ -54,21 +65,15 @@ class MotionObserver:
         needle: its kinematics.
         min_hold: the coils hold their currents for at least this long; for how much longer is not known [s].
         max_speed: of the pull that is compensated [m/s].
-        max_interval: two poses farther apart say nothing of whether the needle follows [s].
     """
 
-    def __init__(
-        self,
-        needle: NeedleKinematics,
-        min_hold: float = math.inf,
-        max_speed: float = math.inf,
-        max_interval: float = MAX_GAP,
-    ) -> None:
-        self._needle, self._min_hold, self._max_speed, self._max_interval = needle, min_hold, max_speed, max_interval
+    def __init__(self, needle: NeedleKinematics, min_hold: float = math.inf, max_speed: float = math.inf) -> None:
+        self._needle, self._min_hold, self._max_speed = needle, min_hold, max_speed
         limit_pair(0.0, 0.0, max_speed)  # loaded now, and not within the loop
         self._place, self._velocity, self._covariance = np.zeros(2), np.zeros(2), np.zeros((2, 2))
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
         self._seen: tuple[float, Vector] | None = None  # the last pose that counted
+        self._innovation = math.nan  # of the last pose, squared over its variance
         self._applied: deque[tuple[float, Vector]] = deque()  # what the currents were set for, each with its start
 
     @property
@@ -81,7 +86,9 @@ class MotionObserver:
         (ex, ey), (x, y) = self._needle.chord_direction(heading), self._velocity
         return NeedleTwist(float(ex * x + ey * y), float(ex * y - ey * x), 0.0)
 
-    def update(self, tail: Vector, heading: Vector, stamp: float, trusted: bool = False) -> MotionStep | None:
+    def update(
+        self, tail: Vector, heading: Vector, stamp: float, trusted: bool = False, stamp_deviation: float = 0.0
+    ) -> MotionStep | None:
         """Update with a measured pose; return the motion since the last one, None where it cannot be compared.
 
         Args:
@@ -89,48 +96,57 @@ class MotionObserver:
             heading: unit vector at the tail, shape (2,).
             stamp: when it was measured [s].
             trusted: whether to learn also from a needle that stands still.
+            stamp_deviation: standard deviation of that time [s].
         """
         e = self._needle.chord_direction(heading)
         middle = tail + 0.5 * self._needle.chord * e
         last, self._last = self._last, (stamp, middle, e)
         if last is None or not 0.0 < stamp - last[0] <= MAX_GAP:
             self._velocity, self._seen = np.zeros(2), None
-        self._learn(stamp, middle, trusted)
+        self._learn(stamp, middle, trusted, stamp_deviation)
         interval = 0.0 if last is None else stamp - last[0]
-        applied = self._mean_applied(stamp - interval, stamp) if 0.0 < interval <= self._max_interval else None
+        applied = self._mean_applied(stamp - interval, stamp) if 0.0 < interval <= MAX_GAP else None
         if last is None or applied is None:
             return None
         before = last[2]
         turn = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
         swing = 0.5 * self._needle.chord * (e - before)
-        return MotionStep(
-            stamp, interval, interval * applied[2:4], interval * applied[4], middle - last[1], turn, swing
-        )
+        expected, turned = interval * applied[2:4], interval * applied[4]
+        driven, measured = interval * applied[:2], middle - last[1]
+        seen = driven, self._velocity, self._innovation
+        return MotionStep(stamp, interval, expected, turned, measured, turn, swing, *seen)
 
-    def _learn(self, stamp: float, middle: Vector, trusted: bool) -> None:
+    def _learn(self, stamp: float, middle: Vector, trusted: bool, deviation: float) -> None:
         """Update the filter with a measured middle, shape (2,) [m], if that counts."""
-        seen = self._seen
+        seen, self._innovation = self._seen, math.nan
         interval = math.inf if seen is None else stamp - seen[0]
         applied = self._mean_applied(stamp - interval, stamp) if interval <= MAX_STILL else None
         if seen is None or applied is None:
             self._seen = stamp, middle
             self._place, self._covariance = middle, np.diag([PLACE_DEVIATION**2, PULL_NOISE * MAX_GAP])
-        elif trusted or not applied[:2].any() or math.hypot(*(middle - seen[1])) > VISIBLE:
-            self._seen = stamp, middle
-            self._predict(interval, applied[:2])
-            innovation = middle - self._place
-            gain = self._covariance[0] / (self._covariance[0, 0] + PLACE_DEVIATION**2)
-            self._covariance = self._covariance - np.outer(gain, self._covariance[0])
-            self._place = self._place + gain[0] * innovation
-            learnt = self._velocity + gain[1] * innovation
-            self._velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
+            return
+        place, covariance = self._predicted(interval, applied[:2])
+        early, late = (self._mean_applied(stamp - interval + by, stamp + by) for by in (-deviation, deviation))
+        change = np.zeros(5) if early is None or late is None else 0.5 * interval * (late - early)
+        noise, doubt = covariance[0, 0] + PLACE_DEVIATION**2, float(change[:2] @ change[:2])
+        off = middle - place
+        self._innovation = float(off @ off) / (2.0 * (noise + STAMP_DEVIATIONS**2 * doubt))
+        gain = covariance[0] / (noise + doubt)
+        learnt = self._velocity + gain[1] * (middle - place)
+        velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
+        is_seen = trusted or not applied[:2].any() or math.hypot(*(middle - seen[1])) > VISIBLE
+        if is_seen or math.hypot(*velocity) < math.hypot(*self._velocity):
+            self._seen, self._velocity = (stamp, middle), velocity
+            self._place, self._covariance = (
+                place + gain[0] * (middle - place),
+                covariance - np.outer(gain, covariance[0]),
+            )
 
-    def _predict(self, interval: float, applied: Vector) -> None:
-        """Predict place and covariance after an interval [s] with a velocity by the currents, shape (2,) [m/s]."""
-        self._place = self._place + interval * (applied + self._velocity)
+    def _predicted(self, interval: float, applied: Vector) -> tuple[Vector, Vector]:
+        """Return place [m] and covariance after an interval [s] with a velocity by the currents, shape (2,) [m/s]."""
         step = np.array([[1.0, interval], [0.0, 1.0]])
         noise = PULL_NOISE * np.array([[interval**3 / 3.0, interval**2 / 2.0], [interval**2 / 2.0, interval]])
-        self._covariance = step @ self._covariance @ step.T + noise
+        return self._place + interval * (applied + self._velocity), step @ self._covariance @ step.T + noise
 
     def apply(self, now: float, applied: Vector, intended: Vector, turn_rate: float) -> None:
         """Register what currents are set for from a time on.
@@ -183,6 +199,11 @@ class MotionStep(NamedTuple):
         measured: displacement of the middle, shape (2,) [m].
         measured_turn: change of the heading [rad].
         swing: displacement of the middle by that turn, where it is about the tail, shape (2,) [m].
+        driven: displacement of the middle that the currents alone would give, shape (2,) [m].
+        pull: velocity that the thread's pull gives it, as it is known at the second pose, shape (2,) [m/s].
+        innovation: nu . nu / (2 S) of the second pose, with the innovation nu of the observer's filter and its variance
+            S in each direction, with stamps that are off by `STAMP_DEVIATIONS`; not a number where the pose cannot be
+            compared.
     """
 
     stamp: float
@@ -192,6 +213,9 @@ class MotionStep(NamedTuple):
     measured: Vector
     measured_turn: float
     swing: Vector
+    driven: Vector = NO_MOTION
+    pull: Vector = NO_MOTION
+    innovation: float = math.nan
 
 
 class FollowMonitor:
@@ -211,28 +235,49 @@ class FollowMonitor:
     in the shortest window of at least `MIN_WINDOW` with |E| >= d, and is not the needle where
     |M| > STILL_SHARE |E| + |B| within twice that time. A taut thread may hold it: the field then probes it
     by a small turn, which a held needle follows and a pose that is not the needle's does not. A turn of the field as
-    commanded in that window serves as well. Pure: times come in, in seconds of the stamps' clock.
+    commanded in that window shows it as well.
+
+    A turn proves no place, and a moving place no heading. So the displacement by currents and pull is kept since the
+    middle was last seen to move, with the pull that was known then, and the turn of the field since the heading was
+    last seen to turn: that is how far a needle has gone whose poses are not its own. Beyond `MAX_UNSEEN`, or
+    `MAX_UNSEEN_TURN` of a needle that nothing but its thread touches, they are taken for that.
+
+    Nor are poses the needle's that change their motion faster than a pull does: the mean of nu . nu / (2 S) of the
+    observer's filter over `MIN_WINDOW`, and at least `MIN_INNOVATIONS` poses, is at most `MAX_INNOVATION`.
+
+    Pure: times come in, in seconds of the stamps' clock.
 
     Source: none.
 
     Args:
         min_distance: shorter displacements are not judged [m].
         slack_ratio: how many times as fast as expected the needle moves when the thread is slack.
+        max_interval: between two poses, up to which their motion is compared with the expected one [s]: in a longer one
+            the coils were off, and a thread has moved the needle.
     """
 
-    def __init__(self, min_distance: float, slack_ratio: float = 1.0) -> None:
+    def __init__(self, min_distance: float, slack_ratio: float = 1.0, max_interval: float = math.inf) -> None:
         self._min_distance, self._slack_ratio = max(min_distance, MIN_DISTANCE), slack_ratio
+        self._max_interval = max_interval
         self._steps: deque[MotionStep] = deque()
+        # Since the middle was last seen to move: its displacement, as measured and as driven; the pull that was known.
+        self._still, self._unseen, self._proven = NO_MOTION, NO_MOTION, NO_MOTION
+        self._still_turn = self._unseen_turn = 0.0  # since the heading was last seen to turn, the same [rad]
+        self._innovations: deque[tuple[float, float]] = deque()  # stamp and innovation
         self._probed: float | None = None  # stamp of the pose that began the probe
-        self._turned = 0.0  # by which the field was turned since
+        self._followed = -math.inf  # stamp of the pose up to which a turn has shown that the needle follows
+        self._turned = 0.0  # by which the field was turned since the probe began
         self._direction = 1.0
         self._trusted_until = -math.inf
         self._suspicion = ""
 
     def clear(self) -> None:
         """Forget all motion, as of a needle that is armed anew."""
+        self._still, self._unseen, self._proven = NO_MOTION, NO_MOTION, NO_MOTION
+        self._still_turn = self._unseen_turn = 0.0
+        self._innovations.clear()
         self._steps.clear()
-        self._probed = None
+        self._probed, self._followed = None, -math.inf
 
     def end_probe(self) -> None:
         """End a probe without a verdict, as where the command ends."""
@@ -259,12 +304,22 @@ class FollowMonitor:
             step: the motion.
             at_shape: whether the needle lies at wall or shape, which may hold it for a while.
         """
+        self._count_unseen(step)
+        if (unseen := math.hypot(*self._unseen)) > MAX_UNSEEN:
+            return f"needle does not follow: it is not seen to move, where it is driven by {1e3 * unseen:.2g} mm"
+        if abs(self._unseen_turn) > MAX_UNSEEN_TURN and not at_shape:
+            return (
+                f"needle does not follow: it is not seen to turn, where the field turns by {self._unseen_turn:.2g} rad"
+            )
+        if (innovation := self._mean_innovation(step)) > MAX_INNOVATION and not at_shape:
+            text = f"its motion changes by {math.sqrt(innovation):.2g} standard deviations of what a pull does"
+            return f"needle does not follow: {text}"
+        if step.interval > self._max_interval:
+            return ""
         min_distance = self._min_distance * (SHAPE_FACTOR if at_shape else 1.0)
         self._steps.append(step)
         while step.stamp - self._steps[0].stamp > MAX_WINDOW:
             self._steps.popleft()
-        if self._probed is not None:
-            return self._judge_probe(step.stamp, self._probed)
         expected, measured, swing, about_tail = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
         field_turn = turn = error = span = 0.0
         for entry in reversed(self._steps):
@@ -288,14 +343,44 @@ class FollowMonitor:
         is_straight = abs(field_turn) < 0.5 * MAX_TURN  # else the direction of E depends on when the needle turned
         if is_straight and error > max(MAX_ERROR * self._min_distance, MAX_ERROR_SHARE * distance):
             return f"{text}, elsewhere"
+        if self._probed is not None:
+            return self._judge_probe(step.stamp, self._probed)
+        is_new = step.stamp - span > self._followed - 1e-9
         enough = span >= MIN_WINDOW and distance >= min_distance and bool(step.expected.any())
-        if not enough or measured @ expected >= MIN_SHARE * distance**2:
+        if not (enough and is_new) or measured @ expected >= MIN_SHARE * distance**2:
             return ""
         if is_straight and span <= 2.0 * MIN_WINDOW and moved > STILL_SHARE * distance + math.hypot(*about_tail):
             return f"{text}, elsewhere"
         self._suspicion, self._probed, self._turned = text, step.stamp, 0.0
         self._direction = math.copysign(1.0, field_turn)
-        return self._judge_turn(step.stamp, field_turn, turn)
+        self._judge_turn(step.stamp, field_turn - step.expected_turn, turn)  # a needle that lags is probed
+        return ""
+
+    def _count_unseen(self, step: MotionStep) -> None:
+        """Count by how much the needle should have moved and turned since it was last seen to."""
+        self._still = self._still + step.measured
+        if math.hypot(*self._still) > VISIBLE:
+            self._still, self._unseen, self._proven = NO_MOTION, NO_MOTION, step.pull
+        elif step.driven.any():
+            self._unseen = self._unseen + step.driven + step.interval * self._proven
+        self._proven = min(self._proven, step.pull, key=lambda pull: math.hypot(*pull))
+        self._still_turn, self._unseen_turn = (
+            self._still_turn + step.measured_turn,
+            self._unseen_turn + step.expected_turn,
+        )
+        if abs(self._still_turn) > VISIBLE_TURN:
+            self._still_turn = self._unseen_turn = 0.0
+
+    def _mean_innovation(self, step: MotionStep) -> float:
+        """Return the mean innovation of the last poses; 0 where there are too few."""
+        if math.isnan(step.innovation):
+            self._innovations.clear()
+            return 0.0
+        self._innovations.append((step.stamp, step.innovation))
+        while len(self._innovations) > MIN_INNOVATIONS and step.stamp - self._innovations[0][0] > MIN_WINDOW:
+            self._innovations.popleft()
+        enough = len(self._innovations) >= MIN_INNOVATIONS
+        return sum(value for _, value in self._innovations) / len(self._innovations) if enough else 0.0
 
     def _error(self, expected: Vector, measured: Vector, about_tail: Vector) -> float:
         """Return how far a displacement is from those of a needle that is held, slack, or turns about its tail [m].
@@ -315,18 +400,23 @@ class FollowMonitor:
     def _judge_probe(self, stamp: float, since: float) -> str:
         steps = [entry for entry in self._steps if entry.stamp > since]
         turn = sum(entry.measured_turn for entry in steps)
-        problem = self._judge_turn(stamp, sum(entry.expected_turn for entry in steps), turn)
+        problem = self._judge_turn(stamp, sum(entry.expected_turn for entry in steps[:-1]), turn)
         is_over = self._probed is not None and stamp - since > PROBE_TIMEOUT
         return self._suspicion if is_over else problem
 
     def _judge_turn(self, stamp: float, expected: float, measured: float) -> str:
-        """End the probe once the field has turned far enough; return why the needle does not follow, or nothing."""
+        """End the probe once the field has turned far enough; return why the needle does not follow, or nothing.
+
+        Args:
+            stamp: of the last pose [s].
+            expected: turn of the field up to the pose before, as the needle takes its time to turn to it [rad].
+            measured: turn of the needle up to the last pose [rad].
+        """
         if abs(expected) < 0.8 * PROBE_TURN:
             return ""
         if measured * math.copysign(1.0, expected) < PROBE_SHARE * abs(expected):
             return self._suspicion
-        self.clear()
-        self._trusted_until = stamp + TRUST_TIME
+        self._probed, self._followed, self._trusted_until = None, stamp, stamp + TRUST_TIME
         return ""
 
 

@@ -21,7 +21,7 @@ from magnetosuture_thread.coils.certificate import (
     is_clear_turned,
     safe_time,
 )
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inner
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted
 from magnetosuture_thread.geometry.needle_arc import needle_chord
 from magnetosuture_thread.geometry.obstacles import ContactRows, polygon_rows, shape_distance
 from magnetosuture_thread.geometry.polyline import Points
@@ -39,7 +39,7 @@ STUCK = 1e-3  # of the speed after the limits; a needle that is left no more res
 Pair = tuple[float, float]
 
 
-@compiled
+@compiled_uncounted
 def move_pose(
     chord: tuple[float, float, float], pose: Vector, along: float, left: float, turn_rate: float, duration: float
 ) -> None:
@@ -138,6 +138,13 @@ class NeedleKinematics:
         """Return where the tip is, shape (2,) [m]."""
         return np.asarray(tail + self.chord * self.chord_direction(heading))
 
+    def turned_to(self, tail: Vector, heading: Vector, angle: float) -> tuple[Vector, Vector]:
+        """Return tail and heading of a needle that is turned about its chord's middle to a direction of it [rad]."""
+        chord, c, s = self._chord
+        e, to = self.chord_direction(heading), np.array([math.cos(angle), math.sin(angle)])
+        heading = np.array([c * to[0] + s * to[1], c * to[1] - s * to[0]])
+        return tail + 0.5 * chord * (e - to), heading
+
     def body_velocity(self, heading: Vector, velocity: Vector) -> tuple[float, float]:
         """Return the components of a tip velocity along the chord and across it, to its left [m/s]."""
         e = self.chord_direction(heading)
@@ -178,7 +185,7 @@ class NeedleKinematics:
         return pose[:2], pose[2:]
 
 
-@compiled
+@compiled_uncounted
 def needle_margin(data: FilterData, needle: PosedNeedle) -> tuple[float, int]:
     """Return the minimum distance of the needle's axis from wall and shapes, less keep_out [m], and of which shape."""
     minimum, shape = np.inf, WALL
@@ -192,7 +199,7 @@ def needle_margin(data: FilterData, needle: PosedNeedle) -> tuple[float, int]:
     return minimum - data.keep_out, shape
 
 
-@compiled
+@compiled_uncounted
 def limit_pair(x: float, y: float, largest: float) -> Pair:
     """Return a vector scaled down to a maximum norm; its direction is kept."""
     # Scaled by the largest component first: the squares of a hostile command may overflow.
@@ -206,7 +213,7 @@ def limit_pair(x: float, y: float, largest: float) -> Pair:
     return ux * (largest / norm), uy * (largest / norm)
 
 
-@compiled
+@compiled_uncounted
 def limit_velocity(
     commanded: Pair, slowdown: float, max_speed: float, previous: Pair, max_change: float
 ) -> tuple[float, float, bool, bool]:
@@ -307,7 +314,7 @@ def find_rows(needle: PosedNeedle, reach: float, rows: Rows) -> int:
     return used
 
 
-@compiled
+@compiled_uncounted
 def project_onto_half_planes(
     point: NDArray[np.float64], given: Points, bounds: NDArray[np.float64], work: Points, found: NDArray[np.float64]
 ) -> bool:
@@ -315,7 +322,9 @@ def project_onto_half_planes(
     # Of size one, so that the tolerance means something however small or large the point is.
     size = math.hypot(point[0], point[1])
     if size == 0.0:
-        size = max(1e-300, np.abs(bounds).max())
+        size = 1e-300
+        for i in range(len(bounds)):
+            size = max(size, abs(bounds[i]))
     x, y = point[0] / size, point[1] / size
     for i in range(len(given)):
         length = math.hypot(given[i, 0], given[i, 1])
@@ -427,6 +436,16 @@ def _is_clear(
     return data.turn_time < data.hold and turned and is_clear_turned(vx, vy, needle, 0.0)
 
 
+@compiled_inline
+def _append(added: AddedRows, count: int, rows: Points, least: Vector, depth: Vector, who: NDArray[np.int64]) -> None:
+    """Write the rows of a user's barriers behind the first `count`; to assign slices takes seconds to compile."""
+    for j in range(len(added.margin)):
+        k = count + j
+        rows[k, 0], rows[k, 1] = added.rows[j, 0], added.rows[j, 1]
+        least[k] = -added.rate[j] * max(added.margin[j], 0.0) - added.drift[j]
+        depth[k], who[k] = -added.margin[j], added.barrier[j]
+
+
 @compiled
 def nearest_clear(
     vx: float, vy: float, needle: PosedNeedle, added: AddedRows, touched: NDArray[np.bool_]
@@ -465,8 +484,7 @@ def nearest_clear(
         aside = gradient[k, 0] * turning[i, 0] + gradient[k, 1] * turning[i, 1]
         rows[k, 0], rows[k, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
-    rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0) - added.drift
-    depth[count:fixed], who[count:fixed] = -added.margin, added.barrier
+    _append(added, count, rows, least, depth, who)
     if not (depth[:fixed] > 0.0).any() and _is_clear(vx, vy, needle, rows[:fixed], least[:fixed], count):
         return vx, vy
     what = safe_time(vx, vy, needle, 0.0)[1]
@@ -572,7 +590,7 @@ def filter_velocity(
     return clear_x, clear_y
 
 
-@compiled
+@compiled_uncounted
 def moved_needle(
     data: FilterData, pose: NDArray[np.float64], velocity: Pair, added: NDArray[np.float64], duration: float
 ) -> None:

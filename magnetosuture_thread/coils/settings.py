@@ -12,12 +12,12 @@ from typing import ClassVar
 from magnetosuture_thread.coils.allocation import (
     MIN_ALIGNING_SHARE,
     CoilAllocation,
-    CoilGainEstimator,
     NeedleMechanics,
 )
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
 from magnetosuture_thread.coils.filter import NeedleSafetyFilter
+from magnetosuture_thread.coils.heading_observer import HeadingObserver
 from magnetosuture_thread.geometry.barrier import load_barriers
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings import shared_parameters as shared
@@ -40,8 +40,11 @@ class CoilBridgeSettings(
 
     autostart: str = quantity(
         "active",
-        "state that the node enters by itself at start; armed only with a driver without hardware",
+        "state that the node enters by itself at start; armed only with a driver that is known to move nothing",
         choices=("unconfigured", "inactive", "active", "armed"),
+    )
+    commissioning: bool = quantity(
+        False, "whether pulses of the coils are given, for commission, and no velocity command is followed"
     )
     stop_file: str = quantity(
         "",
@@ -139,8 +142,23 @@ class CoilBridgeSettings(
         minimum=0.0,
         maximum=10.0,
     )
+    max_pull: float = quantity(
+        1e-4,
+        "greatest force of the thread upon the needle that motion_compensation holds against, whatever poses show",
+        unit="N",
+        minimum=1e-8,
+        maximum=0.1,
+    )
     motion_compensation: bool = quantity(
         False, "whether the coils compensate what the needle's poses show of its motion beside the commanded one"
+    )
+    motion_delay: float = quantity(
+        0.0,
+        "from a current to the motion that poses show, by their stamps, as commission measures it; for "
+        "motion_compensation, which corrects it while the needle turns",
+        unit="s",
+        minimum=0.0,
+        maximum=0.2,
     )
     needle_turning_drag: float = quantity(
         1.6e-7, "drag torque of the needle at 1 rad/s", unit="N m s", minimum=1e-11, maximum=1e-2
@@ -192,6 +210,7 @@ class CoilBridgeSettings(
             self.needle_drag_across,
             self.needle_turning_drag,
             self.needle_drag - self.thread_drag,
+            self.max_pull,
         )
 
     @cached_property
@@ -218,15 +237,16 @@ class CoilBridgeSettings(
 
     def allocation(self) -> CoilAllocation:
         """Return the allocation of velocities to currents."""
-        return CoilAllocation(self.coil_field(), self.needle(), self.aligning_field, self.max_current)
+        fixed = self.coil_field(), self.needle(), self.aligning_field, self.max_current
+        return CoilAllocation(*fixed, period=1.0 / self.rate)
 
     def coil_field(self) -> LoopCoils:
         """Return the coils' field, as calibrated or by their geometry."""
         return LoopCoils(self.coils_properties())
 
-    def gain_estimator(self) -> CoilGainEstimator:
-        """Return what estimates the coils' gains."""
-        return CoilGainEstimator(self.coil_field(), self.needle(), self.thread_drag)
+    def heading_observer(self) -> HeadingObserver:
+        """Return what estimates the needle's heading between its poses, and the coils' gains."""
+        return HeadingObserver(self.coil_field(), self.needle(), self.aligning_field, self.motion_delay)
 
     @property
     def hold_time(self) -> float:
@@ -237,14 +257,13 @@ class CoilBridgeSettings(
     def turn_time(self) -> float:
         """Maximum time for which the needle turns on while nobody looks [s].
 
-        The needle turns towards the field, which held currents hold, with the time constant of its turning drag by its
-        moment and the least field along it; two of these after a command that takes two periods to come into force. Not
-        known, and inf, where its drift is part of its turn.
+        The needle turns towards the field, which held currents hold. It is set ahead by the angle of a turn in the time
+        in which a needle turns to its field, which the least field along it may double and more; twice that after a
+        command that takes two periods to come into force. Not known, and inf, where its drift is part of its turn.
         """
         if not self.motion_compensation:
             return math.inf
-        torque = self.needle_moment * MIN_ALIGNING_SHARE * self.aligning_field
-        return 2.0 / self.rate + 2.0 * self.needle_turning_drag / torque
+        return 2.0 / self.rate + 2.0 * self.allocation().response_time / MIN_ALIGNING_SHARE
 
     def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
         """Return the safety filter for the wall and the shapes of a scene.
@@ -275,8 +294,6 @@ class CoilBridgeSettings(
             if count != known:
                 name = f"{self.GROUP}.calibration"
                 raise ConfigurationError(name, f"{count} coils in {self.calibration}", f"{known}, as in coil_angles")
-        if self.autostart == "armed" and self.driver == "roboclaw":
-            raise self.refused("autostart", "active at most: hardware is armed by an operator")
         if self.keep_out < 0.5 * self.needle_width:
             raise self.refused("keep_out", f"at least {0.5 * self.needle_width:g} m, half of {self.GROUP}.needle_width")
         for name, periods in MIN_TIMEOUT_PERIODS.items():

@@ -127,9 +127,10 @@ class Pursuit:
 class ProcedureExecutor:
     """Takes the needle through the goals of a procedure.
 
-    A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
-    known well enough to go on, the needle is kept where it is: at a zero command the coils are off, and the thread
-    pulls it away. A needle that is stalled while it is commanded (`RestDetector`) backs off, and its goal is
+    A goal's path is planned when its turn comes, from where the needle is then; that of the first goal may be there
+    before. Meanwhile, and while the thread is not known well enough to go on, the needle is kept where it is: at a zero
+    command the coils are off, and the thread pulls it away. A needle that is stalled while it is commanded
+    (`RestDetector`) backs off, and its goal is
     planned anew; one that is off its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a
     turn throws the needle aside, is followed by one that ends as far to the other side. Whether the needle has passed a
     gap, and whether the thread winds about a shape, is judged by both as they are known (`GoalJudge`), not by the path.
@@ -166,6 +167,7 @@ class ProcedureExecutor:
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
+        self._planned: BodyPath | None = None  # before the procedure was begun
         self._pending: PendingPath | None = None
         self._foreseen: PendingPath | None = None  # whether the path leads to its goal
         self._foresees_at = 0.0  # way on the path at which that is asked next [m]
@@ -216,11 +218,16 @@ class ProcedureExecutor:
         way = float(self.path.ends[self._reached]) - before
         return min(1.0, max(0.0, (self._tracker.travel - before) / way)) if way > 0.0 else 1.0
 
-    def start(self) -> None:
-        """Begin, or go on after a pause; the goal's path is planned anew with the next pose."""
+    def start(self, planned: BodyPath | None = None) -> None:
+        """Begin, or go on after a pause, with the next pose; the goal's path is planned anew, unless there is one.
+
+        Args:
+            planned: a path of the present goal, which is taken if the needle is where it begins; None for none.
+        """
         if self.state in (ProcedureState.READY, ProcedureState.PAUSED):
             self.state, self.reason, self.resumes = ProcedureState.RUNNING, "", False
             self._drop_path()
+            self._planned = planned
 
     def pause(self, reason: str) -> None:
         """Rest until `start` is called again, also where the procedure would go on by itself."""
@@ -421,6 +428,9 @@ class ProcedureExecutor:
 
     def _plan(self, middle: Vector, angle: float) -> bool:
         """Plan from a pose, or go on with that; return whether there is a path to track."""
+        planned, self._planned = self._planned, None
+        if planned is not None and self.planner.begins(planned, middle, angle):
+            self._pending = plan_now(lambda: planned)
         if self._pending is None:
             self._ask_for_path(self.goal, middle, angle)
         assert self._pending is not None
@@ -463,7 +473,7 @@ class ProcedureExecutor:
 
     def _drop_path(self) -> None:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
-        self._tracker, self._pending, self._foreseen, self._left = None, None, None, None
+        self._tracker, self._pending, self._foreseen, self._left, self._planned = None, None, None, None, None
         self._rest, self._goal_since = RestDetector(), math.nan
         self._back_off_until = -math.inf
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar, Literal, NamedTuple
@@ -125,6 +126,16 @@ class SmoothPath:
         return np.asarray(tangent / np.linalg.norm(tangent))
 
 
+def delayed_gain(age: float, interval: float) -> float:
+    """Return the gain 1 / (e tau) on a place that is measured late [1/s]: with the delay tau it is critically damped.
+
+    Args:
+        age: of the measurement when its command acts [s].
+        interval: to the next one [s].
+    """
+    return 1.0 / (math.e * max(age + interval, 1e-3))
+
+
 class FollowerCommand(NamedTuple):
     """Setpoint and velocity command of the path follower.
 
@@ -144,9 +155,10 @@ class PathFollower:
 
         v = w dp/dl + k e + c,    e = p(l) - x_tip,    dc/dt = k_i e,    |c| <= half of the speed
 
-    with the setpoint's speed w, which has a trapezoidal profile. The setpoint moves only while poses arrive,
-    and waits while the tip is farther from it than `max_lag`, so it does not run away from a needle that
-    does not move. The path begins along the needle, where its tip is when `settle` is over.
+    with the setpoint's speed w, which has a trapezoidal profile, k at most `delayed_gain`, and k_i at most k^2 / 4,
+    that of two equal roots. The setpoint moves only while poses arrive, and waits while the tip is farther from it than
+    `max_lag`, so it does not run away from a needle that does not move. The path begins along the needle, where its tip
+    is when `settle` is over.
 
     Args:
         settings: waypoints after the tip's initial position, w, k, k_i, and the needle.
@@ -163,13 +175,14 @@ class PathFollower:
         self._length = 0.0
         self._correction = np.zeros(2)
 
-    def compute_command(self, stamp: float, tail: Vector, heading: Vector) -> FollowerCommand:
+    def compute_command(self, stamp: float, tail: Vector, heading: Vector, age: float = 0.0) -> FollowerCommand:
         """Compute the velocity command for a needle pose.
 
         Args:
             stamp: of the pose [s].
             tail: shape (2,) [m].
             heading: unit vector at the tail, shape (2,).
+            age: of the pose when the command is sent [s].
 
         Raises:
             InvalidInputError: waypoints and first pose do not define a path.
@@ -199,11 +212,12 @@ class PathFollower:
         self._done = self._done or (at_end and float(np.linalg.norm(error)) < settings.tolerance)
         if self._done:
             return FollowerCommand(path.point(path.length), np.zeros(2), 1.0)
+        gain = min(settings.gain, delayed_gain(age, interval))
         if not waiting:
-            self._correction += settings.integral_gain * interval * error
+            self._correction += min(settings.integral_gain, 0.25 * gain**2) * interval * error
         size = float(np.linalg.norm(self._correction))
         self._correction *= min(1.0, 0.5 * settings.speed / size) if size > 0.0 else 1.0
-        velocity = speed * path.tangent(self._length) + settings.gain * error + self._correction
+        velocity = speed * path.tangent(self._length) + gain * error + self._correction
         return FollowerCommand(
             # The path is done when the tip has arrived, not the setpoint ahead of it.
             path.point(self._length),

@@ -447,6 +447,11 @@ class NeedlePlanner:
             paths.append(path)
         return tuple(paths)
 
+    def begins(self, path: BodyPath, middle: Vector, angle: float) -> bool:
+        """Return whether a path begins at a pose of the chord, within a step of the lattice of the needle's tip."""
+        turn = math.remainder(angle - float(path.angles[0]), 2.0 * math.pi)
+        return math.dist(middle, path.middles[0]) + self.lever * abs(turn) <= self._step
+
     def beside(self, middle: Vector, angle: float) -> str:
         """Return in words what a needle in a pose is as close to as it may be; empty for nothing."""
         c, s = math.cos(angle), math.sin(angle)

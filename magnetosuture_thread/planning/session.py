@@ -33,6 +33,7 @@ from magnetosuture_thread.settings.configuration import quantity
 from magnetosuture_thread.settings.errors import InvalidInputError
 
 NO_POSE = "no needle pose yet"
+MAX_ABSENCE = 3.0  # in `pose_timeout`; without poses for longer, the needle may be elsewhere: a person looks first
 
 
 @dataclass(frozen=True)
@@ -204,6 +205,12 @@ class LoopState:
         """Return whether the needle's pose is known now."""
         return now - self._pose <= self._settings.pose_timeout
 
+    def absence_problem(self, now: float) -> str:
+        """Return that the needle has not been seen for so long that a person has to look; empty if it has."""
+        limit = MAX_ABSENCE * self._settings.pose_timeout
+        is_known = now - self._pose <= limit
+        return "" if is_known else f"the needle was not seen for more than {limit:g} s"
+
     def condition(self, now: float) -> ThreadCondition:
         """Return what is known, with the reason why a procedure cannot go on; that of before until it has settled.
 
@@ -290,8 +297,9 @@ class ProcedureStatus:
 class ProcedureSession:
     """Holds at most one procedure, and decides when it may go on.
 
-    A pause by a person, by a command of the operator or by a coil bridge that is disarmed lasts until `resume`; one for
-    a needle or thread that is not known ends by itself once they are known again.
+    A pause by a person, by a command of the operator or by a coil bridge that is disarmed lasts until `resume`, as does
+    one for a needle of which there were no poses for `MAX_ABSENCE`; others for a needle or thread that is not known end
+    by themselves once they are known again.
 
     Pure: `now` is a monotonic time [s].
 
@@ -408,19 +416,24 @@ class ProcedureSession:
         self.known.hold_to_run = hold_to_run
         return paths
 
-    def resume(self) -> None:
-        """Begin what is planned, or go on after a pause; the way is planned anew from where the needle is.
+    def resume(self, now: float) -> None:
+        """Begin what is planned, or go on after a pause; the way is planned anew where the needle is elsewhere by then.
+
+        Args:
+            now: a monotonic time [s].
 
         Raises:
-            InvalidInputError: nothing is planned or paused, or the coil bridge is not armed.
+            InvalidInputError: nothing is planned or paused, the coil bridge is not armed, or the needle is not seen.
         """
         executor = self._executor
         if executor is None or executor.state not in (ProcedureState.READY, ProcedureState.PAUSED):
             state = "no procedure" if executor is None else f"a procedure that is {executor.state.value}"
             raise InvalidInputError("resume", state, "one that is planned or paused")
         self.check_armed()
+        if problem := self.known.absence_problem(now):
+            raise InvalidInputError("resume", problem, "a needle that is tracked")
         self.known.accept_disturbances()
-        executor.start()
+        executor.start(self._planned[0][1] if executor.state is ProcedureState.READY else None)
 
     def check_armed(self) -> None:
         """Refuse to begin or to go on while the coil bridge is not armed.
@@ -469,6 +482,7 @@ class ProcedureSession:
             now: a monotonic time [s].
             age: of the pose now [s].
         """
+        self._check_absence(now)
         planner, executor = self._planner, self._executor
         radius = math.inf if planner is None else planner.scene.dish.radius
         self.known.on_pose(now, math.hypot(*tail), radius)
@@ -496,11 +510,16 @@ class ProcedureSession:
 
     def check(self, now: float) -> None:
         """Pause a procedure that cannot go on, also where no pose comes any more."""
+        self._check_absence(now)
         if self._executor is None or self._pose is None or not self.is_commanding:
             return
         condition = self.known.condition(now)
         if condition.problem:
             self._executor.update(*self._pose, condition)
+
+    def _check_absence(self, now: float) -> None:
+        if problem := self.known.absence_problem(now):
+            self.pause(f"{problem}: look, then resume")
 
     def new_plan(self) -> Points | None:
         """Return x, y [m] and angle [rad] of the chord where the needle is to go, shape (m, 3); None if as it was."""
@@ -525,7 +544,7 @@ def compile_planning() -> None:
     at, heading = np.zeros(2), np.array([1.0, 0.0])
     session.on_pose(0.0, at, heading, 0.0)
     session.plan(parse_procedure({"goals": [{"go_to": {"position": [0.01, 0.0]}}]}, "warm-up"), 0.0)
-    session.resume()
+    session.resume(0.0)
     session.known.on_prediction(0.0, 0.0, lambda: np.zeros((2, 2)))
     session.known.on_margins(0.0, "", 0, 1.0, session.known.scene_version)
     for k in range(2):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.planning.follower import delayed_gain
 from magnetosuture_thread.planning.path import BodyPath, turning_points
 
 Vector = NDArray[np.float64]
@@ -28,7 +29,7 @@ MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle th
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that corrections along and of the direction may take
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
-MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
+MAX_AXIS_ANGLE = 0.15  # rad; kept off an axis at the most for a pull along it, which a small turn makes one across
 # s; after the course has changed to the other side of an axis, in which the needle is turned faster
 CROSSING_TIME = 0.3
 CROSSING_STEP = 0.05  # s; in which it is turned by all of the angle at the earliest, also by poses that come in bursts
@@ -71,19 +72,21 @@ class PathTracker:
 
         v = u_r e + k (p_r + b - p),    omega = omega_r + k_theta (theta_r + delta - theta)
 
-    The place is corrected by force, along and across the needle, with k = min(1 / (e tau), `MAX_PLACE_GAIN`): that of a
-    loop that is critically damped with a delay tau, the age of a pose when its command acts and the time to the next.
+    The place is corrected by force, along and across the needle, with k = min(`delayed_gain`, `MAX_PLACE_GAIN`).
     The setpoint's speed has a trapezoidal profile between the places where the needle changes between ahead and back.
     It waits while the needle is farther behind it than `MAX_LAG`, or `MAX_ANGLE` off its direction.
 
     The direction corrects the place where force cannot: delta = s sign(u_r) atan(y / `LOOKAHEAD`), with the error y
     across the path, the share s of the way that is driven, not turned on the spot, and a weight that falls to
     `MIN_STEERED` where force has plenty in reserve. Along the axes of the coils no currents give a force across the
-    needle. Where a pull d is measured, theta stays off them by min(|d| / a, `MAX_AXIS_ANGLE`), with the
-    velocity a that the coils hold for each radian, on the side of theta_r, and jumps to the other side when theta_r
-    crosses. A thread that holds the tail displaces the middle in that turn: before it the place is b, half of that to
-    the side that the needle comes from. All of theta - theta_r stays within what half of the path's leeway allows.
-    Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
+    needle. Where a pull d is measured, with the part d_a across an axis, theta stays off that by
+
+        max(min(|d_a| / a, `MAX_ANGLE`), min(|d| / a, `MAX_AXIS_ANGLE`))
+
+    with the velocity a that the coils hold for each radian, on the side of theta_r, and jumps to the other side when
+    theta_r crosses. A thread that holds the tail displaces the middle in that turn: before it the place is b, half of
+    that to the side that the needle comes from. All of theta - theta_r stays within what half of the path's leeway
+    allows. Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
 
     Source: line-of-sight guidance of ships, Fossen 2011, section 10.3; for the place, proportional control of a
     fully actuated one. Deviation: the weight of the two, by what force is left.
@@ -151,7 +154,7 @@ class PathTracker:
         error = math.hypot(*(place - middle))
         off = place + self._before_crossing(direction, pull) * normal - middle
         along, across = float(off @ e), float(off @ normal)
-        gain = min(MAX_PLACE_GAIN, 1.0 / (math.e * max(age + interval, 1e-3)))
+        gain = min(MAX_PLACE_GAIN, delayed_gain(age, interval))
         steered = self._steered(angle, abs(float(pull @ n)) + gain * abs(across))
         course = min(allowed, max(-allowed, steered * driven * sense * math.atan(across / LOOKAHEAD)))
         off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, pull)))
@@ -199,7 +202,7 @@ class PathTracker:
         if not self._axes:
             return course
         planned, held = self._nearest(direction)
-        kept = min(MAX_AXIS_ANGLE, math.hypot(*pull) / held)  # a pull along it is across it after a small turn
+        kept = self._kept(direction - planned, held, pull)
         side = self._side
         if not side or planned * side <= -AXIS_CROSSED:
             self._side = math.copysign(1.0, planned)
@@ -212,7 +215,7 @@ class PathTracker:
         if not self._axes or not self._side:
             return 0.0
         planned, held = self._nearest(direction)
-        kept, backwards = min(MAX_AXIS_ANGLE, math.hypot(*pull) / held), -float(pull @ _axes_of(direction)[0])
+        kept, backwards = self._kept(direction - planned, held, pull), -float(pull @ _axes_of(direction)[0])
         leeway = self.leeway
         for way in np.linspace(self.travel, min(self.path.length, self.travel + CROSSING_LOOKAHEAD), 6)[1:]:
             leeway, ahead = min(leeway, self.path.leeway_at(way)), self.path.at(way)[1]
@@ -222,6 +225,12 @@ class PathTracker:
                 aside = pivot * self.path.lever * kept
                 return self._side * min(aside, MAX_ASIDE * leeway)
         return 0.0
+
+    @staticmethod
+    def _kept(axis: float, held: float, pull: Vector) -> float:
+        """Return how far off an axis [rad] the coils hold a pull, shape (2,) [m/s]; see `_nearest` for `held`."""
+        across = abs(float(pull @ _axes_of(axis)[1]))
+        return max(min(MAX_ANGLE, across / held), min(MAX_AXIS_ANGLE, math.hypot(*pull) / held))
 
     def _turned(self, begin: float, end: float) -> float:
         """Return by how much the commands before turn the needle from one time to another [rad]."""

@@ -138,6 +138,34 @@ def test_however_it_is_pulled_the_field_stays_along_the_needle_and_turns_it_as_c
     assert found.velocity @ n - found.drift == pytest.approx(-0.001, abs=1e-4)
 
 
+@pytest.mark.parametrize("degrees", [-84.0, -80.0, -76.0])
+@pytest.mark.parametrize("rate", [-3.0, 0.0, 3.0])
+@pytest.mark.parametrize("balance", [0.0, 3e-4])
+def test_in_a_period_the_needle_turns_as_far_as_commanded_however_weak_the_field(
+    degrees: float, rate: float, balance: float
+):
+    """Close to a coil's axis a pull across the needle leaves less of the field than half; integrated by Euler."""
+    settings, middle = read_setup("dish_50mm").coils, np.array([0.0135, -0.006])
+    made, needle, coils = settings.allocation(), settings.needle(), settings.coil_field()
+    angle, period, fields = np.radians(degrees), 1.0 / settings.rate, []
+    for pull in (-0.006, 0.006):
+        e = turned(EAST, angle)
+        found = made.allocate(NeedleTwist(0.002, pull, rate), middle - 0.5 * needle.chord * e, e, balance=balance)
+        theta = angle
+        for _ in range(500):
+            e = turned(EAST, theta)
+            ends = (middle - 0.5 * needle.chord * e, middle + 0.5 * needle.chord * e)
+            x, y = 0.5 * (coils.per_current(ends[0]) + coils.per_current(ends[1])) @ found.currents
+            across = e[0] * y - e[1] * x
+            theta += period / 500 * needle.moment * (across - balance) / needle.turning_drag
+        fields.append(e[0] * x + e[1] * y)
+        assert theta - angle == pytest.approx(rate * period, abs=2e-3)
+        n = np.array([-np.sin(angle), np.cos(angle)])
+        turn_rate = (found.velocity @ n - found.drift) / (0.5 * needle.chord)
+        assert turn_rate == pytest.approx(rate, abs=0.1)
+    assert min(fields) < 0.6 * settings.aligning_field
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.4, np.pi / 4])
 def test_along_the_axes_of_coils_no_currents_hold_the_needle_and_beside_them_they_do(turn: float):
     coils = LoopCoils(coils_around([turn + k * np.pi / 2 for k in range(4)], 0.05, 0.025, 1.2e-3))

@@ -66,6 +66,19 @@ def test_command_and_compensation_give_a_needle_with_a_slack_thread_no_more_than
         assert limit == "speed"
 
 
+@pytest.mark.parametrize("pull", [3e-3, 9e-3, 0.5])
+def test_whatever_pull_is_measured_the_coils_give_the_needle_what_is_wanted_and_the_greatest_pull_at_most(pull: float):
+    settings = CoilBridgeSettings(motion_compensation=True, thread_drag=0.0093, max_pull=6e-5, max_speed=0.02)
+    safety, needle = settings.safety_filter(Scene(Dish(0.05))), settings.needle()
+    coils = CertifiedAllocation(settings.allocation(), settings.max_speed, needle.max_pull_speed)
+    for angle in np.linspace(0.0, 2.0 * math.pi, 12):
+        e = np.array([math.cos(angle), math.sin(angle)])
+        pose = Pose(-0.5 * needle.chord * e, e)
+        found, _ = coils.allocate(NeedleTwist(2e-3), pose, safety, ZERO, math.inf, NeedleTwist(-pull, 0.3 * pull))
+        force = math.hypot((found.velocity @ e) * needle.drag, found.drift * needle.drag_across)
+        assert force <= (2e-3 * needle.slack_drag + settings.max_pull) * (1.0 + 1e-9)
+
+
 @pytest.mark.parametrize("seed", range(20, 30))
 def test_where_currents_are_not_certified_with_what_is_measured_they_are_without_it(seed: int):
     random = np.random.default_rng(seed)
@@ -80,6 +93,28 @@ def test_where_currents_are_not_certified_with_what_is_measured_they_are_without
     else:
         added = Allocation(found.currents, found.velocity - hold.velocity, False, found.drift - hold.drift)
         assert certified_share(safety, pose, added, NeedleTwist()) > 1.0 - 1e-6
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_torque_of_the_thread_certifies_no_currents_that_would_not_be_without_it(seed: int):
+    """The thread may go slack, and takes its torque with it: this counts for neither currents nor their change."""
+    random = np.random.default_rng(seed)
+    safety, made = (
+        SETTINGS.safety_filter(blocks(*random.uniform(2.4e-4, 2.6e-4, 2) * (1.0, -1.0))),
+        SETTINGS.allocation(),
+    )
+    coils, pose = CertifiedAllocation(made, SETTINGS.max_speed), Pose(-1.25e-3 * E, E)
+    uncertified = 0
+    for _ in range(40):
+        pull, wanted = NeedleTwist(*random.uniform(-3e-3, 3e-3, 2)), NeedleTwist(*random.uniform(-4e-3, 4e-3, 3))
+        balance = float(8e-4 * random.standard_normal())  # of the observer, root mean square
+        at = pose, safety, ZERO, math.inf, pull, balance
+        hold, found = coils.allocate(NeedleTwist(), *at)[0], coils.allocate(wanted, *at)[0]
+        if certified_share(safety, pose, hold, pull) < 1.0 and certified_share(safety, pose, found, pull) < 1.0:
+            alone = made.motion(found.currents, pose.tail, pose.heading)
+            assert certified_share(safety, pose, alone, NeedleTwist()) > 1.0 - 1e-6
+            uncertified += 1
+    assert uncertified > 3
 
 
 @pytest.mark.parametrize(("place", "gap"), [(-0.089, 3.56e-4), (-0.07, 3.91e-4)])

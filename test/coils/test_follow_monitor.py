@@ -12,6 +12,7 @@ from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionStep
 
 INTERVAL, SPEED = 0.05, 2e-3  # s and m/s
 EAST, STILL = np.array([SPEED * INTERVAL, 0.0]), np.zeros(2)
+WEST = np.array([-1.0, 0.0])
 
 
 def watch(monitor: FollowMonitor, moved: NDArray[np.float64], *, follows_turns: bool = False, count: int = 40) -> str:
@@ -63,6 +64,64 @@ def test_a_heading_that_turns_farther_than_the_field_is_not_the_needles():
     monitor = FollowMonitor(5e-4)
     faults = [monitor.update(MotionStep(1.0 + 0.05 * k, 0.05, EAST, -0.1, EAST, 0.4, STILL)) for k in range(4)]
     assert "it turned 1.2 rad away from the field" in faults[-1]
+
+
+@pytest.mark.parametrize(("interval", "judged"), [(0.05, True), (0.29, True), (0.31, False)])
+def test_motion_is_judged_at_every_interval_at_which_a_pose_is_valid(interval: float, judged: bool):
+    """In a longer one the coils were off, and a thread has moved the needle."""
+    monitor = FollowMonitor(5e-4, max_interval=0.3)
+    step = MotionStep(0.0, interval, interval / INTERVAL * EAST, 0.0, -interval / INTERVAL * EAST, 0.0, STILL)
+    assert any(monitor.update(step._replace(stamp=interval * k)) for k in range(20)) == judged
+
+
+@pytest.mark.parametrize("interval", [0.02, 0.22, 0.5])
+def test_a_place_that_never_moves_is_not_the_needles_however_it_turns(interval: float):
+    """It is driven at 4 mm/s against a pull of 1 mm/s that was known, and is latched within 1.5 mm."""
+    monitor, driven, pull, count = (
+        FollowMonitor(5e-4, max_interval=0.3),
+        interval * np.array([4e-3, 0.0]),
+        1e-3 * WEST,
+        0,
+    )
+    step = MotionStep(0.0, interval, EAST, 0.3, EAST, 0.3, STILL, driven, pull)
+    assert monitor.update(step) == ""
+    step = step._replace(expected=np.zeros(2), measured=np.zeros(2))
+    while not (fault := monitor.update(step._replace(stamp=count * interval))):
+        count += 1
+    assert "it is not seen to move" in fault
+    assert 0.5 - interval <= count * interval <= 0.5 + interval
+
+
+@pytest.mark.parametrize(
+    ("at_shape", "turned", "is_fault"), [(False, 0.0, True), (False, 0.3, False), (True, 0.0, False)]
+)
+def test_a_heading_that_never_turns_with_the_field_is_not_the_needles(at_shape: bool, turned: float, is_fault: bool):
+    """Its place moves as it should. A shape may hold it."""
+    monitor = FollowMonitor(5e-4)
+    step = MotionStep(0.0, INTERVAL, EAST, 0.1, EAST, 0.1 * turned, STILL, EAST)
+    faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=at_shape) for k in range(8)]
+    assert [fault for fault in faults if "not seen to turn" in fault] == faults[5:] * is_fault
+
+
+@pytest.mark.parametrize(
+    ("innovation", "at_shape", "is_fault"), [(9.1, False, True), (8.9, False, False), (20.0, True, False)]
+)
+def test_a_motion_that_changes_otherwise_than_a_pull_is_not_the_needles(
+    innovation: float, at_shape: bool, is_fault: bool
+):
+    monitor = FollowMonitor(5e-4)
+    step = MotionStep(0.0, INTERVAL, EAST, 0.0, EAST, 0.0, STILL, innovation=innovation)
+    faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=at_shape) for k in range(4)]
+    assert [bool(fault) for fault in faults] == [False, False, is_fault, is_fault]
+
+
+def test_a_needle_that_is_armed_anew_may_have_stood_before():
+    monitor, still, driven = FollowMonitor(5e-4), np.zeros(2), np.array([1.4e-3, 0.0])
+    step = MotionStep(0.0, INTERVAL, still, 0.0, still, 0.0, STILL, driven)
+    assert monitor.update(step) == ""
+    monitor.clear()
+    assert monitor.update(step._replace(stamp=INTERVAL)) == ""
+    assert monitor.update(step._replace(stamp=2 * INTERVAL)) != ""
 
 
 def test_a_motion_that_cannot_be_seen_is_not_judged():

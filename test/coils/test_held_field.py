@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,8 +21,11 @@ def test_a_needle_that_is_turned_stops_turning_within_the_turn_time_though_the_c
     name: str, heading: float, sense: float
 ):
     setup = read_setup(name)
-    coils, rig = setup.coils, setup.rig
+    coils, (x, y, angle) = setup.coils, setup.rig.needle_start
+    start = cmath.rect(1.0, heading - angle) * complex(x, y)  # the setup's own start, turned about the dish's centre
+    rig = replace(setup.rig, needle_start=(start.real, start.imag, heading))
     dynamics = rig.dynamics(Scene(Dish(setup.scene.dish.diameter), ()))
+    assert dynamics.heading == pytest.approx(heading)
     allocation, needle = coils.allocation(), coils.needle()
     rate, period = sense * coils.max_speed / (0.5 * needle.chord), 1.0 / coils.rate
     angle, previous = dynamics.heading, allocation.zero().currents

@@ -112,6 +112,33 @@ def test_nothing_moves_before_the_start_nor_in_a_pause():
     assert run.state is ProcedureState.DONE
 
 
+@pytest.mark.parametrize(("x", "turn", "plans"), [(0.0, 0.0, 0), (5e-5, 0.03, 0), (5e-4, 0.0, 1), (0.0, 0.5, 1)])
+def test_a_path_planned_before_the_start_is_taken_if_the_needle_is_where_it_begins(x: float, turn: float, plans: int):
+    asked = []
+
+    def submit(task: Callable[[], Any]) -> PendingPath:
+        asked.append(task)
+        return plan_now(task)
+
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, submit=submit), Needle()
+    pose = run.planner.pose(needle.tail, needle.heading)
+    (path,) = run.planner.plan_all(run.procedure, *pose)
+    moved = Needle(-0.006 + x, 0.0, turn)
+    run.start(path)
+    moved.run(run, 60.0)
+    assert (run.state, len(asked)) == (ProcedureState.DONE, plans)
+
+
+def test_a_path_planned_before_the_start_is_not_taken_after_a_pause():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    (path,) = run.planner.plan_all(run.procedure, *run.planner.pose(needle.tail, needle.heading))
+    run.start(path)
+    run.pause("before a pose has come")
+    run.start()
+    needle.run(run, 1.0)
+    assert run.path is not path
+
+
 def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
     run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
     run.start()

@@ -154,12 +154,12 @@ def test_a_shape_that_is_hidden_behind_another_is_wrapped_and_one_is_not_from_in
     goal = {"wrap": {"around": "post_0", "angle": 6.0}}
     (path,) = planner.plan_all(procedure(goal), np.array([-0.006, 0.0]), 0.0)
     assert swept(path, np.array([0.006, 0.0])) > 6.0
-    ring = [(0.014 * math.cos(a), 0.014 * math.sin(a)) for a in np.linspace(0.0, math.tau, 64, False)]
-    hole = [(0.012 * math.cos(a), 0.012 * math.sin(a)) for a in np.linspace(math.tau, 0.0, 64, False)]
+    ring = [(0.007 * math.cos(a), 0.007 * math.sin(a)) for a in np.linspace(0.0, math.tau, 64, False)]
+    hole = [(0.005 * math.cos(a), 0.005 * math.sin(a)) for a in np.linspace(math.tau, 0.0, 64, False)]
     shape = SceneShape("ring", "tissue", Polygon(tuple(ring), (tuple(hole),)))
     planner = NeedlePlanner(Scene(Dish(), (shape,)), NeedleKinematics(0.0025), KEEP_OUT, 0.1)
     with pytest.raises(PlanningError, match="no way for the needle to wrap"):
-        planner.plan_all(procedure({"wrap": {"around": "ring", "angle": 6.0}}), np.array([0.004, 0.0]), 0.0)
+        planner.plan_all(procedure({"wrap": {"around": "ring", "angle": 6.0}}), np.array([0.001, 0.0]), 0.0)
 
 
 def test_a_bar_is_wrapped_by_less_thread_than_a_disc_of_its_girth():

@@ -136,9 +136,18 @@ def test_before_a_crossing_the_needle_is_on_the_side_that_the_turn_takes_it_from
             velocities.append(float(tracker.compute_command(frame / RATE, place, angle, 0.002, 1.0, pull).twist[1]))
         return max(velocities)
 
-    slack, taut = aside(np.array([0.0, 1.2e-2])), aside(np.array([-1.2e-2, 0.0]))
+    slack, taut = aside(np.array([1.2e-2, 0.0])), aside(np.array([-1.2e-2, 0.0]))
     assert 0.0 < slack < 0.5 * taut, "to the left, as the turn to the right takes the middle to the right"
     assert taut <= 8.0 * 0.4 * LEEWAY + 1e-9
+
+
+@pytest.mark.parametrize(("pull", "kept"), [(5e-3, 0.2), (2e-2, 0.35)])
+def test_a_needle_is_kept_as_far_off_an_axis_as_the_pull_across_it_needs(pull: float, kept: float):
+    """The coils hold 25 mm/s a radian off the axis; a pull along it needs less."""
+    for angle in (0.0, 0.7):
+        c, s = math.cos(angle), math.sin(angle)
+        assert PathTracker._kept(angle, 0.025, pull * np.array([-s, c])) == pytest.approx(kept)
+        assert PathTracker._kept(angle, 0.025, pull * np.array([c, s])) == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize("slowdown", [1.0, 0.5, 0.35])

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,14 @@ class CoilDriver(Protocol):
 
     No call may wait for a device: slow operations belong in a thread of the driver's own, and their results in
     its state. After any failure of the device a driver reconnects by itself, always from zero: it drops earlier
-    currents, and does not apply later ones with a delay.
+    currents, and does not apply later ones with a delay. One whose thread has died is not ready.
+
+    Attributes:
+        moves_nothing: whether it is known that its currents move nothing real: only then the bridge may arm itself, and
+            the power stage need not stop by itself (`DriverState.timeout`).
     """
+
+    moves_nothing: ClassVar[bool]
 
     def open(self) -> None:
         """Start to connect, with all currents at zero; success is reported in the state.
@@ -88,6 +94,8 @@ class SimulatedDriver:
         send: sends currents of shape (coils,) [A] to the simulation.
         listeners: returns the number of simulations that subscribe.
     """
+
+    moves_nothing: ClassVar[bool] = True
 
     def __init__(self, coils: int, send: Callable[[Vector], None], listeners: Callable[[], int]) -> None:
         self._coils, self._send, self._listeners = coils, send, listeners

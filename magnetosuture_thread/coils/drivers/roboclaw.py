@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import serial
@@ -628,7 +628,13 @@ class LineThread(threading.Thread):
         self._wake.set()
 
     def run(self) -> None:
-        """Connect and serve the boards, again after each failure, until `stop`."""
+        """Connect and serve the boards, again after each failure, until `stop`; a thread that dies is not ready."""
+        try:
+            self._run()
+        finally:
+            self._mailbox.set_failed(self._number, f"{self._path}: its thread has ended")
+
+    def _run(self) -> None:
         failures = 0
         while not self._stopping.is_set():
             ready_at, problem, port = None, "closed", None
@@ -731,6 +737,8 @@ class RoboClawDriver:
     Raises:
         DriverError: ports, addresses, baud rate or timeout are invalid.
     """
+
+    moves_nothing: ClassVar[bool] = False
 
     def __init__(
         self, settings: CoilBridgeSettings, coils: int | None = None, apply_timeout: float | None = None

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.calibration import CoilCalibration
-from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+from magnetosuture_thread.coils.drivers.roboclaw import Board, RoboClawDriver
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig import power as packets
@@ -142,6 +142,22 @@ def test_where_one_line_fails_all_coils_are_at_zero_until_it_is_back(bench, kind
         assert not driver.state().ready
         del vars(bench.boards[0])["receive"]
         bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties again")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_dies_is_a_loss_for_good(bench, monkeypatch: pytest.MonkeyPatch):
+    driver = bench.open(**PATIENT)
+    losses = driver.state().losses
+
+    def die(board: Board) -> None:
+        raise SystemExit  # all others are caught
+
+    monkeypatch.setattr(Board, "poll", die)
+    bench.wait(lambda: not any(line.is_alive() for line in driver._lines), "the threads to die")
+    state = driver.state()
+    assert not state.ready
+    assert state.problem.count("its thread has ended") == 2
+    assert state.losses == losses + 1
 
 
 def test_a_port_that_goes_and_comes_back_begins_at_zero(bench):
