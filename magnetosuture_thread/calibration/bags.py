@@ -16,6 +16,7 @@ from magnetosuture_thread.calibration.result import CalibrationResult, to_yaml
 from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.evaluation.recorded import BagInput, BagSelection, open_bag, setup_of_notes
+from magnetosuture_thread.evaluation.replay import picture_or_log
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError, InvalidInputError
@@ -71,8 +72,6 @@ def calibrate_bags(
         ConfigurationError: the setup, the material or a parameter cannot be used.
         InvalidInputError: the bags are of different threads.
     """
-    from magnetosuture_thread.calibration.plot import draw_calibration  # late, as it imports matplotlib
-
     picture = selection.pop("picture", None) or output.with_suffix(".png")
 
     def advance(index: int, share: float) -> None:
@@ -108,8 +107,15 @@ def calibrate_bags(
         result, fits = unfinished_result(runs, settings, best)
     with whole_file(output) as partial_file:
         partial_file.write_text(to_yaml(result), encoding="utf-8")
-    with whole_file(picture) as partial_file:
-        draw_calibration(partial_file, result, fits)
+
+    def draw() -> bytes:
+        from magnetosuture_thread.calibration.plot import draw_calibration  # late, as it imports matplotlib
+
+        with whole_file(picture) as partial_file:
+            draw_calibration(partial_file, result, fits)
+        return b""
+
+    picture_or_log(draw, log)
     return result
 
 

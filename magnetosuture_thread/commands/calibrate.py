@@ -145,8 +145,8 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     4x4_50 lie around the dish, their centres SPACING apart on a square around its centre: 0 at the top left, then
     clockwise, all upright.
 
-    With --needle the needle's length is measured over eight frames that show both of its ends, and written for every
-    node.
+    With --needle the needle's length is measured over eight frames that show both of its ends, with a thread or
+    without, and its size is written for every node.
     """
     by_markers = options.markers is not None
     if by_markers and (options.region or options.rim):
@@ -176,7 +176,8 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
         looked = VisionTrackerSettings(region_px=tuple(options.region or ()), rim=options.rim or "")
         result = calibrate_by_dish(images, options.dish_diameter, looked)
     if options.needle is not None:
-        result = replace(result, needle_length=measure_needle_length(images, result, *options.needle))
+        length, width = options.needle
+        result = replace(result, needle=(measure_needle_length(images, result, length, width), width))
     with whole_file(options.output) as partial:
         head = f"# UNVERIFIED: {one_line(source.unverified)}\n" if source.unverified else ""
         partial.write_text(head + result.to_yaml(), encoding="utf-8")
@@ -188,9 +189,9 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     terminal.log(f"by {by}; {result.frames} frames, scatter {result.scatter_px:.2f} px")
     if result.remark:
         terminal.log(result.remark)
-    if result.needle_length is not None:
-        terminal.log(f"the needle is {1e3 * result.needle_length:.3f} mm long")
-    terminal.log(f"parameters: {options.output}")
+    if result.needle is not None:
+        terminal.log(f"the needle is {1e3 * result.needle[0]:.3f} mm long")
+    terminal.log(f"parameters: {options.output}, for track --setup with --dish-diameter {options.dish_diameter:g}")
     return command.DONE
 
 

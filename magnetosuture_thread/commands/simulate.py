@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from magnetosuture_thread import ConfigurationError
+from magnetosuture_thread import ConfigurationError, Scene
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
@@ -22,10 +23,13 @@ from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.evaluation.tables import LoopCollector, LoopSummary, loop_table, outcome_line
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.polyline import arc_lengths
+from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.power import board_addresses
+from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.rig.truth import bare_rig, changed_parameters, with_rig
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.files import find_file, whole_folder
@@ -50,7 +54,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
     duration = "end after this many seconds (default: at the end of the path or procedure)"
     option("--duration", type=command.number_argument(0.1, 1e5), help=duration)
-    option("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
+    task = parser.add_mutually_exclusive_group()
+    task.add_argument("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
+    bare = "a needle without a thread in an empty dish, for commission --live: nothing steers, until Ctrl-C"
+    task.add_argument("--bare", action="store_true", help=bare)
+    command.add_rig(parser)
     clock = parser.add_mutually_exclusive_group()
     rate = "run with a simulated clock, this much faster than real time (default: in real time)"
     clock.add_argument("--rate", type=command.number_argument(MIN_RATE, 5.0), help=rate)
@@ -67,19 +75,23 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     the setup's path. All are processes of their own, on a ROS domain that nobody else uses. Everything is
     simulated, and the bag says so.
 
-    With --procedure, needle_planner executes it in place of path_follower. Whether it succeeded, or why it failed, is
-    at the end of the table, and in summary.json in BAG. Where the computer skips a tenth of the frames or more, that is
-    the reason: a lower --rate gives it more time.
+    With --bare nothing steers: the dish waits for `commission --live`. With --procedure, needle_planner executes it in
+    place of path_follower. Whether it succeeded, or why it failed, is at the end of the table, and in summary.json in
+    BAG. Where the computer skips a tenth of the frames or more, that is the reason: a lower --rate gives it more time.
 
     SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
     exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
     and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
     new = not options.output.exists()
-    chosen = command.given(options, "duration", "rate", "boards", "procedure")
+    chosen = command.given(options, "duration", "rate", "boards", "rig")
     try:
         with terminal.progress("simulate") as advance:
-            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **chosen)
+            chosen |= {"log": terminal.log, "progress": advance}
+            if options.bare:
+                host_bare_rig(options.setup, options.output, **chosen)
+                return command.DONE
+            summary = simulate(options.setup, options.output, procedure=options.procedure, **chosen)
     except KeyboardInterrupt:
         if new and options.output.exists():
             terminal.log(f"what was recorded is in {options.output}")
@@ -109,6 +121,7 @@ def simulate(
     rate: float | None = None,
     boards: bool = False,
     procedure: str = "",
+    rig: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> LoopSummary:
@@ -130,6 +143,7 @@ def simulate(
         boards: whether the bridge drives the rig through simulated RoboClaw boards on pseudo-terminals, by the
             driver for real ones; they keep real time, so not with `rate`.
         procedure: name or path of a procedure; empty for the setup's path.
+        rig: what is simulated where it is not as the setup says, see `with_rig`.
         log: called with a line for a person at each stage.
         progress: called with the share done, 0 to 1.
 
@@ -140,12 +154,9 @@ def simulate(
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
     setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
-    task = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
-    if setup.vision.image_transport != "compressed":
-        name, expectation = "vision_tracker.image_transport", "compressed: the bag must hold what the tracker saw"
-        raise ConfigurationError(name, setup.vision.image_transport, expectation, str(setup.path))
-    with whole_folder(output, is_recording=True) as folder:
-        problem = _Run(setup, task, duration, rate, boards, log, progress).record(folder, output.name)
+    believed, setup = setup.rig, with_rig(setup, rig)
+    task: _Task = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
+    problem = _Run(setup, believed, task, duration, rate, boards, log, progress).write(output)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
     if problem:
@@ -168,6 +179,47 @@ def simulate(
         if task.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     return summary
+
+
+def host_bare_rig(
+    setup_name: str,
+    output: Path,
+    *,
+    duration: float | None = None,
+    rate: float | None = None,
+    boards: bool = False,
+    rig: str = "",
+    log: Log = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> None:
+    """Run rig, tracker, model and a bridge that commissions, around a needle without a thread that nothing steers.
+
+    Args:
+        setup_name: name or path of a setup; its scene is without shapes here.
+        output: as of `simulate`, as are the others.
+        duration: it ends after this many seconds; with an interruption if None.
+        rate: how much faster than real time.
+        boards: whether there are simulated boards.
+        rig: what is simulated.
+        log: called with a line for a person at each stage.
+        progress: called with the share done.
+
+    Raises:
+        BagError: the output exists or cannot be written.
+        ConfigurationError: the setup cannot be used.
+        GraphError: a node ended or did not come.
+        KeyboardInterrupt: passed on; its bag is there.
+    """
+    believed = read_setup(setup_name)
+    setup = with_rig(believed, rig)
+    setup = replace(setup, rig=bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))).with_scene(
+        Scene(setup.scene.dish)
+    )
+    problem = _Run(setup, believed.rig, _Bare(), duration, rate, boards, log, progress).write(output)
+    if problem == INTERRUPTED:
+        raise KeyboardInterrupt
+    if problem:
+        raise GraphError(f"{problem}; what was recorded is in {output}")
 
 
 def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
@@ -272,22 +324,57 @@ class _Procedure:
         return f"{self.result['state']} after {elapsed:.0f} s{reason}"
 
 
+class _Bare:
+    """Nothing to do, until somebody ends it; attributes as of `_Path`. The bridge waits for a person to arm it."""
+
+    node = ""
+    arguments = tuple(live.arguments_of({"coil_bridge:commissioning": "true"}))
+    recorded: tuple[topics.Topic, ...] = ()
+    time_limit, stage, share, ended = math.inf, 2, 0.0, False
+    result: dict[str, Any] | None = None
+
+    def poll(self, recorder: clients.Recorder) -> None:
+        """Take nothing."""
+
+    def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
+        """Return nothing."""
+        return ""
+
+
+_Task: TypeAlias = _Path | _Procedure | _Bare
+
+
 @dataclass
 class _Run:
     """One run of the graph; see `simulate`."""
 
     setup: Setup
-    task: _Path | _Procedure
+    believed: RigSettings
+    task: _Task
     duration: float | None
     rate: float | None
     boards: bool
     log: Log
     progress: Progress
 
+    def write(self, output: Path) -> str:
+        """Run the graph into a bag; return what went wrong, so that the bag stays.
+
+        Raises:
+            ConfigurationError: the camera's frames are not compressed.
+        """
+        transport = self.setup.vision.image_transport
+        if transport != "compressed":
+            expectation = "compressed: the bag must hold what the tracker saw"
+            raise ConfigurationError("vision_tracker.image_transport", transport, expectation, str(self.setup.path))
+        with whole_folder(output, is_recording=True) as folder:
+            return self.record(folder, output.name)
+
     def record(self, folder: Path, name: str) -> str:
         """Run the graph and record it; return what went wrong, so that the bag stays."""
         setup, task = self.setup, self.task
         arguments = ["--params-file", str(setup.path.resolve()), *live.OWN, *task.arguments]
+        arguments += live.arguments_of(changed_parameters(setup.rig, self.believed))
         if self.rate is not None:
             arguments += live.arguments_of({"use_sim_time": "true", "rig_simulator:rate": float(self.rate)})
         text, what = setup.path.read_text(encoding="utf-8"), f"the whole rig, closed loop, setup {setup.name}"
@@ -299,6 +386,9 @@ class _Run:
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
             bridge = {"coil_bridge:driver": "simulated", "coil_bridge:autostart": "armed"}
             bridge = _wired(ports, len(setup.coils.coil_angles)) if self.boards else bridge
+            if not task.node:
+                write_scene(setup.scene, Path(ports) / "scene.yaml")
+                bridge |= {"scene": f"{ports}/scene.yaml", "coil_bridge:autostart": "active"}
             arguments += live.arguments_of(bridge)
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
@@ -310,14 +400,17 @@ class _Run:
     def _run(self, graph: live.OwnGraph, recorder: clients.Recorder, sink: _Sink) -> str:
         with graph.interruption:
             _wait(recorder, graph.check, self.log)
-        if self.boards:
+        if self.boards and self.task.node:
             _arm()
+        if not self.task.node:
+            self.log(f"for others: export ROS_DOMAIN_ID={graph.domain} ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST")
         self.log("running" if self.rate is None else f"running at {self.rate:g} times the speed")
         sink.running = True
         try:
             # For bridge and recorder: on a busy machine the recorder finds who steers up to 3 s after the bridge does,
             # and the bag would lack the start.
-            graph.nodes.start(self.task.node, arguments=("-p", f"{self.task.node}:audience:=2"))
+            if self.task.node:
+                graph.nodes.start(self.task.node, arguments=("-p", f"{self.task.node}:audience:=2"))
             with graph.interruption:
                 return self._steer(recorder, graph.check)
         except KeyboardInterrupt:
@@ -336,7 +429,7 @@ class _Run:
             elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
             self.progress(task.share if duration is None else min(1.0, elapsed / duration) * bool(stage))
             fault = recorder.status_texts.get("coil_bridge", ("", {}))[0]
-            if task.ended or fault.startswith("fault: "):  # after which the needle rests for good
+            if task.ended or (task.node and fault.startswith("fault: ")):  # after which the needle rests for good
                 recorder.spin(0.5 / rate)
                 return "" if task.ended else f"coil_bridge: {fault}"
             if duration is not None and stage and elapsed > duration + (EXTRA_TIME if stage == 1 else 0.0):

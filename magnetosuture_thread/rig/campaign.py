@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
@@ -40,13 +39,11 @@ class Variation:
     Attributes:
         seed: that it is drawn by.
         setup: with the rig's settings as they are in truth; those of the nodes are as before.
-        coil_gains: by which each coil is stronger than the bridge believes, shape (m,).
         losses: share of the frames that get lost.
     """
 
     seed: int
     setup: Setup
-    coil_gains: NDArray[np.float64]
     losses: float = 0.05
 
 
@@ -70,8 +67,9 @@ def vary(setup: Setup, seed: int) -> Variation:
     liquids = {name: getattr(rig, name) * liquid for name in ("viscosity", "thread_drag_across", "thread_drag_along")}
     stiffness = rig.thread_bending_stiffness * factor(0.5)
     friction = float(random.uniform(0.0, 0.3))
-    changed = replace(rig, seed=seed, **liquids, thread_bending_stiffness=stiffness, thread_friction=friction)
-    gains = 1.0 + 0.05 * random.uniform(-1.0, 1.0, len(rig.coil_angles))
+    gains = np.array(rig.coil_gains or 1.0) * (1.0 + 0.05 * random.uniform(-1.0, 1.0, len(rig.coil_angles)))
+    changes: dict[str, Any] = {**liquids, "thread_bending_stiffness": stiffness, "thread_friction": friction}
+    changed = replace(rig, seed=seed, coil_gains=tuple(gains.tolist()), **changes)
     x, y, heading = rig.needle_start
     for _ in range(100):
         dx, dy = 1e-3 * random.uniform(-1.0, 1.0, 2)
@@ -83,7 +81,7 @@ def vary(setup: Setup, seed: int) -> Variation:
             drawn.check_scene(scene)
         except ConfigurationError:
             continue
-        return Variation(seed, replace(setup, rig=drawn).with_scene(scene), gains)
+        return Variation(seed, replace(setup, rig=drawn).with_scene(scene))
     expected = "a start with room around it"
     try:
         rig.check_scene(scene)
@@ -311,12 +309,11 @@ def run_procedure(
     planner.check(procedure)
     pilot, rig = _Pilot(procedure, planner), Rig(variation.setup.rig, setup.scene)
     execution = pilot.executor
-    truth: dict[str, Any] = {"losses": variation.losses, "coil_gains": variation.coil_gains, "recorder": recorder}
-    loop = ClosedLoop(setup, rig, pilot, variation.seed, camera=camera, **truth)
+    loop = ClosedLoop(setup, rig, pilot, variation.seed, camera=camera, losses=variation.losses, recorder=recorder)
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
     figures, truth_of_goals = extremes.figures, GoalTruth(procedure, setup.scene)
-    began, planned, weighted, way, before = math.nan, 0.0, 0.0, 0.0, 0.0
+    began, replanned, weighted, way, before = math.nan, 0.0, 0.0, 0.0, 0.0
     pursued: tuple[int, BodyPath | None, float] = 0, None, 0.0  # goal, path, and what is left of it [m]
     reason = f"not done after {MAX_TIME:g} s"
     try:
@@ -333,11 +330,11 @@ def run_procedure(
             met = execution.goal if execution.state is not executor.ProcedureState.DONE else len(procedure.goals)
             truth_of_goals.update(met, middle, frame.tail, frame.thread)
             if math.isnan(began) and running:
-                began, planned = frame.time, _planned_time(execution, frame)
+                began = frame.time
             last, known, left = pursued
             is_anew = path is not known and execution.goal == last and isinstance(procedure.goals[last], ThreadGoal)
             if is_anew and path is not None and known is not None:
-                planned += max(0.0, path.length - left) / procedure.limits[last].speed
+                replanned += max(0.0, path.length - left) / procedure.limits[last].speed
             if execution.is_tracking and path is not None:
                 pursued = execution.goal, path, path.length - execution.travel
             ahead = max(0.0, execution.travel - before)
@@ -350,7 +347,7 @@ def run_procedure(
     except SolverError as error:
         reason = f"{type(error).__name__}: {error}"
     figures.time_s = rig.time - began if math.isfinite(began) else rig.time
-    figures.ideal_time_s = planned * (weighted / way if way > 0.0 else 1.0)
+    figures.ideal_time_s = (pilot.planned_duration + replanned) * (weighted / way if way > 0.0 else 1.0)
     reached = execution.state is executor.ProcedureState.DONE
     limits = figures.beyond_limits(setup.coils.keep_out).values()
     reasons = [*filter(None, [reason]), *truth_of_goals.failures(reached), *limits]
@@ -360,33 +357,32 @@ def run_procedure(
     return RunResult(variation.seed, not reasons, words, reached, met, figures, rig.time, instants, closest)
 
 
-def _planned_time(execution: executor.ProcedureExecutor, frame: LoopFrame) -> float:
-    """Return the time of the paths from here to the end at their goals' speeds [s]; 0, and end it, without a way."""
-    heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
-    try:
-        pose = execution.planner.pose(frame.tail, heading)
-        paths = execution.planner.plan_all(execution.procedure, *pose, frame.condition.vertices)
-    except PlanningError as error:
-        execution.abort(str(error))
-        return 0.0
-    return planned_duration(execution.procedure, paths)
-
-
 class _Pilot:
-    """Executes a procedure as the needle planner does: paths are ready as long after they are asked for as that takes.
+    """Executes a procedure as the needle planner does: it is planned as a whole before it begins.
 
-    The time is counted by the states of the lattice that are looked at, so that a run is the same on any machine.
+    Paths that are asked for later are ready as long after that as planning takes, counted by the states of the lattice
+    that are looked at, so that a run is the same on any machine.
+
+    Attributes:
+        executor: of the procedure.
+        planned_duration: of the paths that were planned before it began, at their goals' speeds [s]; 0 without a way.
     """
 
     def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
         self.executor = executor.ProcedureExecutor(procedure, planner, self._submit)
-        self._now = 0.0
+        self.planned_duration, self._now = 0.0, 0.0
 
     def __call__(self, stamp: float, tail: Vector, heading: Vector, thread: executor.ThreadCondition) -> Vector:
         """Return the motion of the needle, and begin as soon as the thread is known."""
-        self._now = stamp
-        if self.executor.state is executor.ProcedureState.READY and not thread.problem:
-            self.executor.start()
+        self._now, execution = stamp, self.executor
+        if execution.state is executor.ProcedureState.READY and not thread.problem:
+            try:
+                pose = execution.planner.pose(tail, heading)
+                paths = execution.planner.plan_all(execution.procedure, *pose, thread.vertices)
+                self.planned_duration = planned_duration(execution.procedure, paths)
+                execution.start(paths[0])
+            except PlanningError as error:
+                execution.abort(str(error))
         return self.executor.update(stamp, tail, heading, thread)
 
     def _submit(self, task: Callable[[], BodyPath]) -> executor.PendingPath:

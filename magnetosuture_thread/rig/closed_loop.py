@@ -114,7 +114,6 @@ class ClosedLoop:
         seed: of noise and lost frames.
         camera: whether frames are rendered and tracked; else the tracker's noise is added to the truth.
         losses: share of the frames that get lost, 0 to 1.
-        coil_gains: by which the coils are stronger than the bridge believes, shape (m,); all 1 if None.
         recorder: gets what the nodes would publish; None for nobody.
     """
 
@@ -127,12 +126,10 @@ class ClosedLoop:
         *,
         camera: bool = False,
         losses: float = 0.0,
-        coil_gains: Vector | None = None,
         recorder: LoopRecorder | None = None,
     ) -> None:
         self.setup, self.rig, self._controller, self._recorder = setup, rig, controller, recorder
         self._random, self._losses = np.random.default_rng([seed, 1]), losses
-        self._gains = np.ones(len(rig.currents)) if coil_gains is None else coil_gains
         latch, self._driver = ArmingLatch(), DriverState(True)
         self.bridge = CoilBridge(setup.coils, latch, setup.scene)
         latch.activate()
@@ -162,7 +159,7 @@ class ClosedLoop:
         self._reason, self._pull = output.reason, output.pull
         if self._recorder is not None:
             self._recorder.on_bridge(self.now, output)
-        self.rig.apply(self._gains * output.allocation.currents, self.now - START)
+        self.rig.apply(output.allocation.currents, self.now - START)
         self.now += 1.0 / self.setup.coils.rate
         return frame
 
@@ -177,19 +174,20 @@ class ClosedLoop:
         return LoopFrame(self.now - START, *truth, self._condition, self._commanded, self._reason)
 
     def _measure(self, frame: RigFrame) -> Measurement | None:
-        due = self.now + LATENCY
+        stamp = self.now + frame.stamp_delay
+        due = stamp + LATENCY
         if self._tracker is None:
             deviation = np.array([1e-5, 1e-5, 5e-3])  # m and rad; of a tracked needle, see docs/results.md
             tail = frame.tail + deviation[:2] * self._random.standard_normal(2)
             angle = frame.heading + deviation[2] * self._random.standard_normal()
             heading, covariance = np.array([math.cos(angle), math.sin(angle)]), np.diag(deviation**2)
-            return Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
+            return Measurement(due, stamp, tail, heading, covariance, self._observe(frame.thread))
         if frame.image is None:
             return None
-        track = self._tracker.on_image(self.now, frame.image).track
+        track = self._tracker.on_image(stamp, frame.image).track
         if not len(track.tail) or len(track.heading) == 0:
             return None
-        return Measurement(due, self.now, track.tail, track.heading, track.covariance, track.observation)
+        return Measurement(due, stamp, track.tail, track.heading, track.covariance, track.observation)
 
     def _observe(self, thread: Points) -> ThreadObservation:
         """Return the thread with the noise of a tracked centreline, which is alike over a length."""
@@ -261,7 +259,8 @@ class RunBag:
         stamp, rig = round(1e9 * now), self._rig
         if frame.image is not None:
             jpeg, size = encode_jpeg(frame.image, rig.jpeg_quality), (rig.camera_width, rig.camera_height)
-            self._write(stamp, packing.camera_outputs(stamp, jpeg, size, self._view, rig.camera_distance))
+            seen = stamp + round(1e9 * frame.stamp_delay)
+            self._write(seen, packing.camera_outputs(seen, jpeg, size, self._view, rig.camera_distance))
         self._write(stamp, ground_truth_outputs(stamp, frame))
 
     def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:

@@ -10,13 +10,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from magnetosuture_thread.coils.field import fields_per_current
-from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.contact import Shapes, Surface, Vector, clear, point_contacts
@@ -53,8 +53,6 @@ MAX_HALVINGS = 8
 MIN_PART = 1e-6  # of Newton's move, below which the line search ends
 MAX_ITERATIONS = 60  # of Newton in a step
 CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
-# Typed: a kernel is compiled again for each one that is written out.
-EXACT, CONVEX = cast(bool, np.bool_(False)), cast(bool, np.bool_(True))
 
 
 class CoilField:
@@ -70,10 +68,21 @@ class CoilField:
         length: of the winding along its axis, 0 for a flat coil [m].
         turns: their number.
         loops: along the length of a coil.
+        gains: by which the field of each coil differs from that, 1 each if not given.
+        residual: flux density that is there without currents, shape (2,) [T].
     """
 
     def __init__(
-        self, angles: Sequence[float], distance: float, radius: float, length: float, turns: float, loops: int = 6
+        self,
+        angles: Sequence[float],
+        distance: float,
+        radius: float,
+        length: float,
+        turns: float,
+        loops: int = 6,
+        *,
+        gains: Sequence[float] = (),
+        residual: ArrayLike = (0.0, 0.0),
     ) -> None:
         nodes, weights = np.polynomial.legendre.leggauss(loops if length > 0.0 else 1)
         away = distance + 0.5 * length * nodes
@@ -81,12 +90,18 @@ class CoilField:
         direction = np.repeat(np.asarray(angles, dtype=np.float64), len(nodes))
         self._axes = np.array([np.cos(direction), np.sin(direction)])
         self._numbers = np.tile(np.array([away, np.full(len(nodes), radius), field]), len(angles))
+        self._numbers[2] *= np.repeat(np.asarray(gains or np.ones(len(angles))), len(nodes))
+        self._residual = np.asarray(residual, dtype=np.float64)
         self._shape = 2, len(angles), len(nodes)
 
     def per_current(self, point: Vector) -> Vector:
         """Return the flux density at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
         loops = fields_per_current(float(point[0]), float(point[1]), self._axes, self._numbers)
         return np.asarray(loops.reshape(self._shape).sum(axis=2))
+
+    def at(self, point: Vector, currents: Vector) -> Vector:
+        """Return the flux density at a point of shape (2,) [m] under currents of shape (m,) [A], shape (2,) [T]."""
+        return np.asarray(self.per_current(point) @ currents + self._residual)
 
 
 @dataclass(frozen=True)
@@ -192,7 +207,7 @@ class Bodies(NamedTuple):
     shapes: Shapes
 
 
-@compiled
+@compiled_uncounted
 def add_needle(q: Vector, bodies: Bodies, terms: StepTerms, system: System, convex: bool) -> float:
     """Add the needle's terms: drag, poles in the field of the step, contact of its outline.
 
@@ -245,7 +260,7 @@ def add_needle(q: Vector, bodies: Bodies, terms: StepTerms, system: System, conv
     return float(energy)
 
 
-@compiled
+@compiled_uncounted
 def add_clamp(q: Vector, needle: Needle, segment: float, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add d |x_1 - x_0 + R (D, 0)|^2, the half cell of bending at a clamped tail.
 
@@ -276,11 +291,11 @@ def add_clamp(q: Vector, needle: Needle, segment: float, gradient: Vector, band:
 class Field(Protocol):
     """The flux density of coils."""
 
-    def per_current(self, point: Vector) -> Vector:
-        """Return that at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
+    def at(self, point: Vector, currents: Vector) -> Vector:
+        """Return that at a point of shape (2,) [m] under currents of shape (m,) [A], shape (2,) [T]."""
 
 
-@compiled
+@compiled_uncounted
 def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System, driven: bool, convex: bool) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 
@@ -315,6 +330,13 @@ def _largest(values: Vector, lever: float) -> float:
     return float(largest)
 
 
+@compiled_inline
+def _move(start: Vector, part: float, step: Vector, moved: Vector) -> None:
+    """Write the state after a part of a step; to assign an array to a slice takes seconds to compile."""
+    for i in range(len(start)):
+        moved[i] = start[i] + part * step[i]
+
+
 @compiled
 def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> tuple[int, float, float]:
     """Move a state to where a step's value is least.
@@ -336,12 +358,12 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
     gradient = system.gradient
     lever = math.sqrt(bodies.needle.tip[0] ** 2 + bodies.needle.tip[1] ** 2)  # of an angle as a way of the tip
     current, move = trial.copy(), np.inf
-    energy = _assemble_energy(trial, bodies, terms, system, driven, EXACT)
+    energy = _assemble_energy(trial, bodies, terms, system, driven, False)
     force = _largest(gradient, 1.0 / lever)
     for iteration in range(1, MAX_ITERATIONS + 1):
         chol = system.band.copy()
         if not factor(chol):
-            _assemble_energy(current, bodies, terms, system, driven, CONVEX)
+            _assemble_energy(current, bodies, terms, system, driven, True)
             chol = system.band.copy()
             if not factor(chol):
                 return -1, np.inf, force
@@ -357,8 +379,8 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
         low, high, part = 0.0, np.inf, 1.0
         low_energy, low_slope, high_energy, high_slope = energy, slope, energy, slope
         while True:
-            trial[:] = current + part * step
-            new = _assemble_energy(trial, bodies, terms, system, driven, EXACT)
+            _move(current, part, step, trial)
+            new = _assemble_energy(trial, bodies, terms, system, driven, False)
             force = _largest(gradient, 1.0 / lever)
             if move <= TOLERANCE:
                 return iteration, move, force
@@ -383,8 +405,7 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
                 root = math.sqrt(square)
                 share = 1.0 - (high_slope + root - middle) / (high_slope - low_slope + 2.0 * root)
             part = low + width * min(max(share, 2e-3), 0.5)
-        current[:] = trial
-        energy = new
+        current, energy = trial.copy(), new
     return (MAX_ITERATIONS if move <= STALLED * TOLERANCE else -1), move, force
 
 
@@ -576,7 +597,7 @@ class RigDynamics:
         flux = np.zeros((2, 2))
         if currents is not None and self.field is not None:
             tip = trial[1:3] + self._turned(trial, needle.tip)
-            flux = np.array([self.field.per_current(at) @ currents for at in (trial[1:3], tip)])
+            flux = np.array([self.field.at(at, currents) for at in (trial[1:3], tip)])
         if pose is not None:
             trial[:3] = pose
         c, s = math.cos(trial[0]), math.sin(trial[0])

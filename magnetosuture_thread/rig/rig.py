@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -109,6 +110,7 @@ class RigFrame:
         time: since the start [s].
         image: BGR, shape (height, width, 3); None if the frame got lost, or is not rendered.
         lateness: how long it is held back before anybody gets it [s].
+        stamp_delay: by which its stamp is later than `time` [s].
         tail: the needle's true tail, shape (2,) [m].
         heading: its true angle at the tail [rad].
         thread: the thread's true centreline from the tail on, shape (n + 1, 2) [m].
@@ -130,6 +132,7 @@ class RigFrame:
     lost: bool = False
     covers: tuple[Cover, ...] = ()
     gain: float = 1.0
+    stamp_delay: float = 0.0
 
 
 class Rig:
@@ -174,6 +177,7 @@ class Rig:
         self._random = np.random.default_rng(settings.seed + 1)
         self.time, self.began, self._applied_at = 0.0, math.inf, 0.0
         self.currents = np.zeros(len(settings.coil_angles))
+        self._commands = deque[tuple[float, Vector]]()  # that are not in force yet, and from when on they are
         self._max_time, self._max_iterations = max_time, max_iterations
         self.problem, self.is_watched = "", True
         self._asked_at = -math.inf  # last time that currents were asked for since the problem
@@ -217,7 +221,7 @@ class Rig:
 
         Args:
             currents: of each coil, shape (m,) [A].
-            time: since the start [s].
+            time: since the start, to which `current_delay` is added [s].
 
         Raises:
             InvalidInputError: of the wrong number, or not finite.
@@ -225,9 +229,12 @@ class Rig:
         if currents.shape != self.currents.shape or not np.all(np.isfinite(currents)):
             expected = f"{len(self.currents)} finite numbers [A]"
             raise InvalidInputError("rig/currents.current", currents.tolist(), expected)
-        self.advance(time)
         limit = self._settings.coil_max_current
-        currents = np.clip(currents, -limit, limit)
+        self._commands.append((time + self._settings.current_delay, np.clip(currents, -limit, limit)))
+        self.advance(time)
+
+    def _begin(self, currents: Vector, time: float) -> None:
+        """Put currents in force at a time [s], up to which everything has moved."""
         if self.problem:
             if not np.any(currents):
                 return
@@ -251,6 +258,14 @@ class Rig:
         Raises:
             SolverError: they have no next state; they stay where they are from now on.
         """
+        while self._commands and self._commands[0][0] <= time:
+            due, currents = self._commands.popleft()
+            self._advance(due)
+            self._begin(currents, due)
+        self._advance(time)
+
+    def _advance(self, time: float) -> None:
+        """Move up to a time [s] under the currents that are in force."""
         if self.problem:
             self.time = max(self.time, time)
             return
@@ -317,8 +332,9 @@ class Rig:
         truth = tail, dynamics.heading, thread, dynamics.thread_pull, dynamics.thread_moment
         lost = "camera_stopped" in kinds or ("dropped_frames" in kinds and chance < 0.5)
         gain = (0.3 if "dim" in kinds else 1.0) * (1.9 if "overexposed" in kinds else 1.0)
-        covers, lateness = self.faults.covers(running, tail, dynamics.tip + away), 0.12 * ("late_frames" in kinds)
-        frame = RigFrame(self.time, None, lateness, *truth, lost, covers, gain)
+        covers, delay = self.faults.covers(running, tail, dynamics.tip + away), self._settings.stamp_delay
+        lateness = delay + 0.12 * ("late_frames" in kinds)
+        frame = RigFrame(self.time, None, lateness, *truth, lost, covers, gain, delay)
         return self.render(frame) if rendered else frame
 
     def render(self, frame: RigFrame) -> RigFrame:

@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.compiled import compiled, compiled_inline
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.rig.contact import Shapes, Vector, clear, point_contacts, segment_contacts, write_row
 
 WIDTH = 6  # of the band: half-width and diagonal
@@ -150,7 +150,7 @@ def drag_matrices(q: Vector, rod: Rod, scale: float) -> Vector:
     return drag
 
 
-@compiled
+@compiled_uncounted
 def add_drag(q: Vector, rest: Vector, drag: Vector, gradient: Vector, band: Vector) -> float:
     """Add sum (x_i - rest_i)' Z_i (x_i - rest_i) / 2, the work of a step against the liquid."""
     energy = 0.0
@@ -167,7 +167,7 @@ def add_drag(q: Vector, rest: Vector, drag: Vector, gradient: Vector, band: Vect
     return energy
 
 
-@compiled
+@compiled_uncounted
 def add_stretching(q: Vector, rod: Rod, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add sum EA / (2 D) (l_i - D)^2; `convex` leaves out what makes second derivatives indefinite."""
     energy = 0.0
@@ -197,7 +197,7 @@ def add_stretching(q: Vector, rod: Rod, gradient: Vector, band: Vector, convex: 
     return energy
 
 
-@compiled
+@compiled_uncounted
 def add_bending(q: Vector, rod: Rod, gradient: Vector, band: Vector) -> float:
     """Add sum EI / D (1 - cos(phi_i)) at inner nodes, phi_i the turn from segment to segment.
 
@@ -223,7 +223,7 @@ def add_bending(q: Vector, rod: Rod, gradient: Vector, band: Vector) -> float:
     return energy
 
 
-@compiled
+@compiled_uncounted
 def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     """Write what nodes 1 ... n and segments sink into; return how many.
 
@@ -248,7 +248,7 @@ def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     return count
 
 
-@compiled
+@compiled_uncounted
 def add_contact(q: Vector, k: float, rows: Vector, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add k / 2 depth^2 of every contact, the rows of `find_contacts`.
 
@@ -291,7 +291,7 @@ def find_friction(contacts: Vector, shapes: Shapes) -> Vector:
     return np.column_stack([np.where(s < 0.0, a, 0.0), np.where(s < 0.0, 0.0, a), s, -ny, nx, limit])
 
 
-@compiled
+@compiled_uncounted
 def factor(band: Vector) -> bool:
     """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
     width = band.shape[1]
@@ -310,7 +310,7 @@ def factor(band: Vector) -> bool:
     return True
 
 
-@compiled
+@compiled_uncounted
 def back_substitute(band: Vector, right: Vector) -> None:
     """Solve in place with the factor that `factor` left."""
     size, width = band.shape
@@ -343,7 +343,7 @@ def crossings(q: Vector) -> NDArray[np.bool_]:
     return crossed
 
 
-@compiled
+@compiled_uncounted
 def find_pairs(q: Vector, rod: Rod, shapes: Shapes, crossed: NDArray[np.bool_], rows: Vector) -> int:
     """Write what of the thread is near itself at the start of a step, see `add_rows`.
 
@@ -394,7 +394,7 @@ def _place(row: Vector, r: int) -> tuple[int, float]:
     return int(row[1]) + r - 2, -weight * (1.0 - s if r < 4 else s)
 
 
-@compiled
+@compiled_uncounted
 def add_rows(q: Vector, terms: StepTerms, rod: Rod, stiffness: float, system: System) -> float:
     """Add what depends on a gap or slip that is linear in a step: contact of the thread with itself, and all friction.
 

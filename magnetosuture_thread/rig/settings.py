@@ -107,6 +107,17 @@ class RigSettings(
     coil_length: float = quantity(0.03, "of the winding along its axis", unit="m", minimum=0.0, maximum=0.5)
     coil_turns: float = quantity(480.0, "of a coil", minimum=1.0, maximum=1e5)
     coil_max_current: float = quantity(30.0, "of the power stage, either way", unit="A", minimum=0.01, maximum=1000.0)
+    coil_gains: tuple[float, ...] = quantity(
+        (),
+        "of each coil's field against that of its windings: negative is wound the other way, 0 is not connected; none "
+        "given: 1 each",
+        minimum=-10.0,
+        maximum=10.0,
+    )
+    current_delay: float = quantity(0.0, "from a command to its currents", unit="s", minimum=0.0, maximum=1.0)
+    residual_field: tuple[float, ...] = quantity(
+        (), "x and y of the field without currents; none given: 0", unit="T", minimum=-0.01, maximum=0.01, multiple=2
+    )
 
     power_stage: str = quantity(
         "topic",
@@ -118,7 +129,9 @@ class RigSettings(
     coil_inductance: float = quantity(0.01, "of a coil on a board", unit="H", minimum=1e-6, maximum=10.0)
     supply_voltage: float = quantity(24.0, "of the boards", unit="V", minimum=1.0, maximum=80.0)
 
-    needle_magnetisation: float = quantity(1e6, "along its body, of NdFeB", unit="A/m", minimum=1e3, maximum=2e6)
+    needle_magnetisation: float = quantity(
+        1e6, "along its body, of NdFeB; negative where the tail attracts", unit="A/m", minimum=-2e6, maximum=2e6
+    )
     needle_start: tuple[float, ...] = quantity(
         (0.003, -0.004, 0.0), "x, y of the tail [m] and heading [rad] at first", minimum=-7.0, maximum=7.0, multiple=3
     )
@@ -143,7 +156,18 @@ class RigSettings(
     camera_height: int = quantity(480, "of a frame", unit="px", minimum=64, maximum=4096)
     camera_height_share: float = quantity(0.9115, "of a frame's height that the dish fills", minimum=0.1, maximum=2.0)
     camera_distance: float = quantity(0.3, "of the camera from the dish", unit="m", minimum=0.01, maximum=10.0)
+    camera_rotation: float = quantity(
+        0.0,
+        "angle of the coils in the image, counter-clockwise as seen, against coil_angles; all else is as seen",
+        unit="rad",
+        minimum=-math.pi,
+        maximum=math.pi,
+    )
+    camera_mirrored: bool = quantity(False, "whether the image is mirrored, about the x axis, before it is turned")
     frame_rate: float = quantity(60.0, "frames a second", unit="Hz", minimum=1.0, maximum=240.0)
+    stamp_delay: float = quantity(
+        0.0, "by which frames are stamped, and come, after they were taken", unit="s", minimum=0.0, maximum=1.0
+    )
     jpeg_quality: int = quantity(85, "of the compressed frames", minimum=1, maximum=100)
     light_gain: float = quantity(1.0, "of the exposure, 1 is well exposed", minimum=0.05, maximum=5.0)
     noise: float = quantity(1.0, "of the sensor, in units of the usual", minimum=0.0, maximum=20.0)
@@ -156,9 +180,15 @@ class RigSettings(
             raise self.refused("obstacle_looks", f"each one of {', '.join(LOOKS)}")
         if len(self.coil_angles) < 1:
             raise self.refused("coil_angles", "at least one coil's angle [rad]")
+        if len(self.coil_gains) not in (0, len(self.coil_angles)):
+            raise self.refused("coil_gains", f"one for each of the {len(self.coil_angles)} coils, or none")
+        if len(self.residual_field) > 2:
+            raise self.refused("residual_field", "x and y [T]")
         ports = len(self.power_stage_ports)
         if self.power_stage == "roboclaw" and (not ports or 2 * ports != len(self.coil_angles)):
             raise self.refused("power_stage_ports", f"a path for two of the {len(self.coil_angles)} coils")
+        if abs(self.needle_magnetisation) < 1e3:
+            raise self.refused("needle_magnetisation", "a magnet's: 1000 A/m or more, either way")
         if self.needle_length < 2.0 * self.needle_width:
             raise self.refused("needle_length", "at least two widths [m]")
         if self.thread_diameter >= self.thread_length:
@@ -219,6 +249,12 @@ class RigSettings(
         touches = scene.dish.has_self_contact(self.thread_diameter)
         return Surface(discs, polygons, scene.dish.radius, friction=self.thread_friction, self_contact=touches)
 
+    def coil_field(self) -> CoilField:
+        """Return the coils' field as the camera sees it: the coils are mirrored and turned in place of its image."""
+        seen = [(-a if self.camera_mirrored else a) + self.camera_rotation for a in self.coil_angles]
+        winding = self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns
+        return CoilField(seen, *winding, gains=self.coil_gains, residual=self.residual_field or (0.0, 0.0))
+
     def dynamics(self, scene: Scene) -> RigDynamics:
         """Return needle and thread at their start, in the field of the coils."""
         x, y, heading = self.needle_start
@@ -230,7 +266,7 @@ class RigSettings(
             NeedleBody(*shape, self.needle_magnetisation, self.viscosity),
             ThreadProperties(*size, *stiffness, *drag, joint, self.thread_diameter),
             self.surface(scene),
-            CoilField(self.coil_angles, self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns),
+            self.coil_field(),
             (x, y),
             heading,
             self.thread_at_start(np.linspace(0.0, 1.0, self.thread_segments + 1)),

@@ -86,6 +86,14 @@ def _check_agreement(settings: Mapping[str, Configuration]) -> None:
                 raise ConfigurationError(f"{group}.{name}", values[group], words)
 
 
+def _check_pull(coils: CoilBridgeSettings, speed: float) -> None:
+    """Refuse a bound of the thread's pull that its own drag exceeds at the speed of the path [m/s]."""
+    drag = coils.thread_drag * speed
+    if coils.motion_compensation and coils.max_pull < drag:
+        rule = f"the drag of the straight thread at path_follower.speed, {speed:g} m/s"
+        raise ConfigurationError(f"{coils.GROUP}.max_pull", coils.max_pull, f"at least {drag:.2g} N, {rule}")
+
+
 def read_setup(name: str, scene: Scene | None = None) -> Setup:
     """Read a setup, given as a path or as the name of one that ships with the package.
 
@@ -101,11 +109,32 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
     with errors_of_file(str(path)):
         _check_agreement(settings)
         setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
+        _check_pull(setup.coils, setup.follower.speed)
         if scene is not None:  # as of a bag, of which no path is followed
             return setup.with_scene(scene)
         if setup.model.scene:
             setup.follower.check_path(setup.scene)
     return setup
+
+
+def read_vision_setup(name: str, scene: Scene | None = None) -> tuple[VisionTrackerSettings, Scene]:
+    """Read what the vision tracker needs of a setup, whatever the file says of other nodes.
+
+    Args:
+        name: of the setup, or the path of its file.
+        scene: in place of the one that the file names.
+
+    Raises:
+        ConfigurationError: there is no such file, it holds anything invalid for the tracker, or no scene is named.
+    """
+    path = find_file("setup", name)
+    settings = load_setup(path, (*SETTINGS_CLASSES, SceneServerSettings), {VisionTrackerSettings.GROUP})
+    vision: VisionTrackerSettings = settings[VisionTrackerSettings.GROUP]
+    if scene is None and not vision.scene:
+        expected = f"a scene file under {EVERY_NODE}, or --scene or --dish-diameter"
+        raise ConfigurationError("scene", "none", expected, str(path))
+    with errors_of_file(str(path)):
+        return vision, scene or read_scene(vision.scene)
 
 
 def read_procedure_setup(procedure: Procedure, name: str = "") -> Setup:

@@ -102,7 +102,6 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"needle_start": (0.0, 0.0)}, "a multiple of 3"),
         ({"needle_curvature": 500.0}, "a half circle"),
         ({"needle_length": 1.5e-3, "needle_width": 1e-3}, "at least two widths"),
-        ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
         ({"obstacle_looks": ("gold",)}, "one of silicone, tissue, hernia"),
         ({"thread_attachment": "sewn"}, "pinned, clamped"),
         ({"power_stage": "roboclaw", "power_stage_ports": ("/tmp/a",)}, "a path for two of the 4 coils"),

@@ -51,10 +51,21 @@ def test_a_near_place_is_reached_by_the_whole_loop(first: RunResult):
 def test_a_run_ends_at_a_fault_of_the_coil_bridge_and_names_it(hernia: Setup, short: Procedure):
     """All coils are connected the wrong way round, so that the needle moves oppositely."""
     drawn = vary(hernia, 3)
-    result = run_procedure(short, hernia, replace(drawn, coil_gains=-drawn.coil_gains))
+    reversed_gains = tuple(-gain for gain in drawn.setup.rig.coil_gains)
+    reversed_rig = replace(drawn.setup, rig=replace(drawn.setup.rig, coil_gains=reversed_gains))
+    result = run_procedure(short, hernia, replace(drawn, setup=reversed_rig.with_scene(hernia.scene)))
     assert not result.success
     assert result.reason.startswith("needle does not follow")
     assert result.simulated_s < 10.0
+
+
+def test_a_rig_of_its_own_is_what_a_campaign_runs_on(short: Procedure, tmp_path: Path):
+    file, truth, output = tmp_path / "short.yaml", tmp_path / "truth.yaml", tmp_path / "campaign"
+    file.write_text(json.dumps(SHORT))
+    truth.write_text("/**/rig_simulator: {ros__parameters: {coil_gains: [-1.0, -1.0, -1.0, -1.0]}}")
+    assert main(["campaign", str(file), "--rig", str(truth), "--first-seed", "3", "--output", str(output)]) == 0
+    (run,) = json.loads((output / "campaign.json").read_text())["runs"]
+    assert run["reason"].startswith("needle does not follow")
 
 
 def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_vary(hernia: Setup):
@@ -63,7 +74,7 @@ def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_var
     assert 0.7 <= factors.min() < 0.8 < 1.2 < factors.max() <= 1.3
     assert {each.setup.model for each in drawn} == {hernia.model}
     assert {each.setup.coils for each in drawn} == {hernia.coils}
-    gains = np.array([each.coil_gains for each in drawn])
+    gains = np.array([each.setup.rig.coil_gains for each in drawn])
     assert np.abs(gains - 1.0).max() <= 0.05
     assert min(each.setup.rig.thread_friction for each in drawn) >= 0.0
     assert max(each.setup.rig.thread_friction for each in drawn) <= 0.3

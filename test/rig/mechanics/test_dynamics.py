@@ -29,8 +29,8 @@ class PlainField:
     def __init__(self, constant: tuple[float, float], gradient: float) -> None:
         self._constant, self._gradient = np.array(constant), gradient
 
-    def per_current(self, point: Vector) -> Vector:
-        return (self._constant + self._gradient * point * [1.0, -1.0])[:, None]
+    def at(self, point: Vector, currents: Vector) -> Vector:
+        return np.asarray(currents[0] * (self._constant + self._gradient * point * [1.0, -1.0]))
 
 
 def rig(

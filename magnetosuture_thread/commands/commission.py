@@ -1,0 +1,147 @@
+"""The command `magnetosuture commission`: a rig measures its coils, its needle and its delay by its own camera."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magnetosuture_thread.calibration.commission import Commissioning
+from magnetosuture_thread.calibration.commission_files import (
+    PULSES,
+    REPORT_FILE,
+    SETUP_FILE,
+    STOPS_FILE,
+    SUMMARY_FILE,
+    RecordedBench,
+    checked_stops,
+    read_rig,
+    read_stops,
+    values_of,
+    verify_square,
+)
+from magnetosuture_thread.calibration.simulated_bench import SimulatedBench
+from magnetosuture_thread.commands import command
+from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
+from magnetosuture_thread.rig.setups import Setup, read_setup
+from magnetosuture_thread.rig.truth import with_rig
+from magnetosuture_thread.settings.errors import BagError
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    command.runs(parser, run_commission)
+    option = parser.add_argument
+    option("setup", metavar="SETUP", help="what is believed of the rig: a setup's name or YAML file")
+    option("--output", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
+    bench = parser.add_mutually_exclusive_group()
+    bench.add_argument("--live", action="store_true", help="the rig that runs on this ROS domain")
+    command.add_rig(bench)
+    option("--namespace", type=command.namespace_argument, default="", metavar="NAME", help="of a rig that runs")
+    option(
+        "--drawn-poses", action="store_true", help="do not render frames: poses are the truth with a tracker's noise"
+    )
+    option("--check", action="store_true", help="say whether the rig is still the one that was measured in DIR")
+    option("--seed", type=command.whole_number, default=0, help="of the needle's start and the pulses (default: 0)")
+
+
+def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> int:
+    """Let a rig measure itself: coils, needle, delay.
+
+    A bare needle lies in the empty dish. Each coil alone moves it, from 10 mA on; then pulses that tell most; then
+    twelve that are predicted and not fitted, and a slow square, by which the verdict is.
+
+    With --live the rig is the one that runs on this ROS domain: its bridge was started with
+    coil_bridge.commissioning:=true, and SETUP is what its nodes were started with. This command arms it, and checks
+    with the first currents that move the needle that emergency stop, lost poses and a bridge that stands still end
+    them. Keep a hand on the switch of the supply. Without it the rig is simulated, that of --rig, which SETUP knows
+    nothing of, without ROS.
+
+    DIR gets
+      setup.yaml     SETUP with what was found, if the verification passed; coils.yaml, which it names
+      summary.json   verdict, values with their intervals, and what is not as SETUP says
+      report.pdf     the same on one page
+      pulses/NNN     a bag of each pulse: currents and poses
+    Ctrl-C ends a pulse with zero currents. The same command goes on where it was interrupted. With --check one pulse a
+    coil is compared with what was measured in DIR; no stop is checked before, and nothing is written.
+    """
+    folder: Path = options.output
+    if options.check:
+        return _check(options, terminal)
+    if (folder / SUMMARY_FILE).exists():
+        raise BagError(folder, "holds a finished commissioning; choose another folder")
+    setup = read_setup(options.setup)
+    notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8"), "seed": str(options.seed)}
+    poses = "poses drawn with a tracker's noise" if options.drawn_poses else "poses tracked in rendered frames"
+    notes["rig"] = "a rig that runs" if options.live else poses
+    if not options.live:
+        notes["simulated"] = f"the rig {options.rig or 'of the setup'}, {poses}"
+    with _bench(setup, options) as (driven_bench, is_live):
+        how, stops = (
+            {"simulated": not is_live, "poses": notes["rig"], "rig": options.rig or setup.name},
+            folder / STOPS_FILE,
+        )
+        bench = RecordedBench(driven_bench, folder / PULSES, notes)
+        first: dict[str, Any] = (
+            {"check_stops": partial(checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
+        )
+        radius = setup.scene.dish.radius
+        result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, **first).run()
+        result = verify_square(result, setup, bench)
+    if bench.reused:
+        terminal.log(f"{bench.reused} pulses were there from a run before")
+    how["rig_time"] = sum(float(pulse.times[-1] - pulse.on) for pulse in result.pulses)
+    if stops.exists():
+        how["stops"] = read_stops(stops)
+    from magnetosuture_thread.calibration.commission_report import write_results  # late, as it imports matplotlib
+
+    summary = write_results(folder, result, setup, how, datetime.date.today().isoformat())
+    if result.model is not None:
+        rows = [
+            (value.name, *_cells(value.value, value.interval, value.believed), value.unit, value.kind)
+            for value in values_of(result, setup.coils)
+        ]
+        columns = ("value", "found", "95 % ±", "setup", "unit", "known by")
+        title = f"{setup.name} as measured" + (" (simulated)" if how["simulated"] else "")
+        terminal.print(command.make_table(title, columns, rows))
+    for finding in (*result.findings, *result.failures):
+        terminal.log(finding)
+    terminal.log(f"verdict: {summary['verdict']}; {folder / REPORT_FILE}")
+    if not result.failures:
+        terminal.log(f"setup: {folder / SETUP_FILE}")
+    return command.FAILED if result.failures else command.DONE
+
+
+@contextmanager
+def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, bool]]:
+    """Yield the bench of the options, and whether it is a rig that runs."""
+    if not options.live:
+        yield SimulatedBench(with_rig(setup, options.rig), drawn=options.drawn_poses, seed=options.seed), False
+        return
+    from magnetosuture_thread.nodes.live_bench import LiveBench  # late, as it needs ROS
+    from magnetosuture_thread.nodes.processes import Interruption
+
+    with Interruption() as interruption, LiveBench(setup, interruption.check, options.namespace) as bench:
+        yield bench, True
+
+
+def _check(options: argparse.Namespace, terminal: command.Terminal) -> int:
+    setup = read_setup(options.setup)
+    rig = read_rig(options.output, setup.coils)
+    with _bench(setup, options) as (bench, _):
+        commissioning = Commissioning(bench, setup.coils, setup.scene.dish.radius, terminal.log, options.seed)
+        changed = commissioning.check(rig)
+    for words in changed or ["the rig is still the one that was measured"]:
+        terminal.log(words)
+    return command.FAILED if changed else command.DONE
+
+
+def _cells(*numbers: float) -> list[str]:
+    return ["" if math.isnan(number) else f"{np.float64(number):.4g}" for number in numbers]

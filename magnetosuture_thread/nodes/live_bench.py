@@ -1,0 +1,413 @@
+"""A rig that runs, as a bench: pulses through its coil bridge, and a needle that its own tracker follows."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from magnetosuture_msgs.msg import CoilBridgeState
+from magnetosuture_msgs.srv import GivePulse
+from numpy.typing import NDArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter, parameter_value_to_python
+
+from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.packing import packed_twist
+from magnetosuture_thread.calibration.commission import AFTER, BEFORE, PATIENCE
+from magnetosuture_thread.calibration.needle_length import find_needle_length
+from magnetosuture_thread.calibration.pulse_model import Pulse
+from magnetosuture_thread.calibration.square import Square
+from magnetosuture_thread.calibration.stop_checks import RESTING, TO_REST, TRIES
+from magnetosuture_thread.coils.pulses import IS_OVER, STOOD_STILL
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.geometry.needle_arc import heading_angle
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.clients import (
+    DISCOVERY_TIME,
+    POLL_PERIOD,
+    TIMEOUT,
+    CoilClient,
+    Inbox,
+    Latest,
+    Services,
+)
+from magnetosuture_thread.nodes.coil_bridge import PROCESS
+from magnetosuture_thread.nodes.node import read_status
+from magnetosuture_thread.rig.setups import Setup
+from magnetosuture_thread.settings.configuration import to_mapping
+from magnetosuture_thread.settings.errors import GraphError, shortened
+from magnetosuture_thread.settings.interface import Service
+from magnetosuture_thread.vision.images import image_of
+from magnetosuture_thread.vision.lens import lens_of
+
+Vector = NDArray[np.float64]
+
+BRIDGE, TRACKER = "coil_bridge", "vision_tracker"
+CHANGE, SET, GET = "change_state", "set_parameters_atomically", "get_parameters"
+KINDS = {
+    CHANGE: "lifecycle_msgs/srv/ChangeState",
+    SET: "rcl_interfaces/srv/SetParametersAtomically",
+    GET: "rcl_interfaces/srv/GetParameters",
+}
+FRAMES = 24  # in which a needle's length is measured
+SAME_LENGTH = 1e-3  # of a needle, as a share; less is not worth another start of the nodes
+
+
+class LiveBench(CoilClient):
+    """See `Bench` and `StopBench`. While it is open the bridge is armed; at its end all is as it was, and disarmed.
+
+    Nodes are changed by their lifecycle and parameters, as by `ros2 lifecycle set` and `ros2 param set`.
+
+    Args:
+        setup: what is believed, and what the nodes were started with.
+        check: called all the time; raises what interrupts.
+        namespace: of the graph.
+
+    Attributes:
+        needle_length: as the camera measures it [m].
+        driver_timeout: after which the boards stop by themselves [s].
+
+    Raises:
+        ConfigurationError: the bridge does not commission.
+        GraphError: bridge, tracker or camera are not there, or something stops the coils.
+        InvalidInputError: no needle is seen.
+    """
+
+    def __init__(self, setup: Setup, check: Callable[[], None], namespace: str = "") -> None:
+        super().__init__(namespace)
+        self._setup, self._check = setup, check
+        self._poses: list[tuple[float, Vector]] = []  # stamp and pose
+        self._texts: dict[str, tuple[str, dict[str, str]]] = {}  # state of each node, and its values
+        self._before: dict[str, list[ParameterMessage]] = {}  # parameters of nodes that were changed
+        kinds: dict[str, str] = {f"{node}/{name}": kind for node in (BRIDGE, TRACKER) for name, kind in KINDS.items()}
+        self._calls = Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
+        self._measured, self._given = (
+            Inbox(self.node, topics.NEEDLE_POSE, 1000),
+            Inbox(self.node, topics.CURRENTS, 1000),
+        )
+        self._reports = Inbox(self.node, topics.DIAGNOSTICS, 100)
+        self._commands = topics.NEEDLE_COMMAND.publisher(self.node)
+        try:
+            self._begin()
+        except BaseException:
+            self.close()
+            raise
+
+    def pulse(self, currents: Vector, seconds: float) -> Pulse:
+        """Give currents for a time, then zeros; see `Bench`.
+
+        Raises:
+            GraphError: the bridge has disarmed, and why; or it stood still again and again.
+        """
+        for _ in range(TRIES):
+            pulse = self._pulse(currents, seconds)
+            state = self._wait_for_state()
+            if not state.armed:
+                raise GraphError(f"coil_bridge: {pulse.ended or '; '.join(state.reasons)}")
+            if not pulse.ended.startswith(STOOD_STILL):  # for then nobody knows when the boards stopped
+                return pulse
+        raise GraphError(f"coil_bridge: {pulse.ended}")
+
+    def follow_square(self, coils: CoilBridgeSettings) -> tuple[float, str]:
+        """Steer the needle's tip slowly around a square; see `Bench`. After it the bridge gives no pulses."""
+        square = Square(coils, self._setup.scene.dish.radius)
+        believed = to_mapping(self._setup.coils)
+        values = {name: value for name, value in to_mapping(square.settings).items() if value != believed[name]}
+        self._restart(BRIDGE, {**values, "commissioning": False})
+        self._await_pose(self._now())
+        fault, last, end = "", self._now(), time.monotonic() + square.time_limit
+        try:
+            self.execute("arm")
+            while not (square.done or fault or time.monotonic() > end):
+                self._turn()
+                for stamp, pose in [entry for entry in self._poses[-8:] if entry[0] > last]:
+                    last = stamp
+                    velocity = square.command(stamp, pose, self._now() - stamp)
+                    self._commands.publish(packed_twist(self.node.get_clock().now().to_msg(), velocity))
+                state = self._state.value
+                if state is not None and state.state == CoilBridgeState.STATE_FAULT:
+                    fault = "; ".join(state.reasons)
+        finally:
+            self.execute("disarm")
+        return square.result(fault)
+
+    def disturbed_pulse(
+        self, currents: Vector, seconds: float, after: float, disturbance: Any, hold: float
+    ) -> tuple[Pulse, float, float]:
+        """Give currents, and disturb for a while once they have flowed for a time; see `StopBench`."""
+        times = [0.0, 0.0]
+
+        def disturb() -> None:
+            self._wait(after)
+            with disturbance:
+                times[0] = self._now()
+                self._wait(hold)
+                times[1] = self._now()
+
+        return self._pulse(currents, seconds, disturb, hold + TO_REST + RESTING), times[0], times[1]
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Press the emergency stop."""
+        self.execute("stop")
+        yield
+
+    @contextmanager
+    def blind(self) -> Iterator[None]:
+        """Let no poses come."""
+        try:
+            self._change(TRACKER, Transition.TRANSITION_DEACTIVATE)
+            yield
+        finally:
+            self._change(TRACKER, Transition.TRANSITION_ACTIVATE)
+
+    def frozen(self) -> Any:
+        """Let the bridge's process stand still; None where it runs on another computer."""
+        host, _, process = self._report(BRIDGE)[1].get(PROCESS, "").rpartition(" ")
+        command = Path("/proc") / process / "cmdline"
+        with suppress(OSError):
+            if host == socket.gethostname() and process.isdigit() and BRIDGE.encode() in command.read_bytes():
+                return _stopped(int(process))
+        return None
+
+    def recover(self, causes: tuple[str, ...]) -> None:
+        """Reset what a check has latched, and arm; see `StopBench`.
+
+        Raises:
+            GraphError: something else is latched, or somebody has disarmed.
+        """
+        state = self._wait_for_state()
+        if state.armed:
+            return
+        if not any(reason.startswith(cause) for reason in state.reasons for cause in causes):
+            raise GraphError(f"coil_bridge: {'; '.join(state.reasons)}")
+        deadline = time.monotonic() + TIMEOUT
+        while True:
+            try:
+                self.execute("reset")
+                self.execute("arm")
+                return
+            except GraphError:  # boards that were lost are connected again
+                if time.monotonic() > deadline:
+                    raise
+            self._wait(0.2)
+
+    def _begin(self) -> None:
+        """Check what has to be, measure the needle, and arm."""
+        state = self._wait_for_state()
+        self._wait(DISCOVERY_TIME)
+        commissioning, self.driver_timeout = self._parameters(BRIDGE, "commissioning", "driver_timeout")
+        if not commissioning:
+            name, expected = f"{BRIDGE}.commissioning", "true: start the bridge by -p coil_bridge:commissioning:=true"
+            raise ConfigurationError(name, False, expected)
+        if state.state == CoilBridgeState.STATE_FAULT:
+            raise GraphError(f"coil_bridge: {'; '.join(state.reasons)}")
+        if state.state == CoilBridgeState.STATE_INACTIVE:  # as after a fault in a run before
+            self._change(BRIDGE, Transition.TRANSITION_ACTIVATE)
+        self._await_driver()
+        self.callback(self._leave)
+        self.needle_length = self._measure_needle()
+        for node in (BRIDGE, TRACKER):
+            if abs(float(self._parameters(node, "needle_length")[0]) / self.needle_length - 1.0) > SAME_LENGTH:
+                self._restart(node, {"needle_length": self.needle_length})
+        self._await_pose(self._now())
+        self.execute("arm")
+
+    def _leave(self) -> None:
+        """Disarm, and let the nodes be as they were."""
+        with suppress(GraphError):
+            self.execute("disarm")
+        for node in [*self._before]:
+            with suppress(GraphError):
+                self._restore(node)
+
+    def _measure_needle(self) -> float:
+        """Return the length of the needle by frames of the camera [m]."""
+        settings = self._setup.vision
+        topic = topics.COMPRESSED_IMAGE if settings.image_transport == "compressed" else topics.IMAGE
+        camera, images, deadline = Inbox(self.node, topic, 2), list[Any](), time.monotonic() + TIMEOUT
+        lens = Latest(self.node, topics.CAMERA_INFO, lens_of)
+        while len(images) < FRAMES:
+            self._turn()
+            lens.poll()
+            new = [image_of(message) for message, _ in camera.read()]
+            images += new if lens.value is None else [lens.value.undistorted(image) for image in new]
+            if time.monotonic() > deadline:
+                raise GraphError(f"{len(images)} frames of the camera within {TIMEOUT:g} s")
+        for inbox in (camera, lens):
+            inbox.close()
+        return find_needle_length(images, settings, Scene(self._setup.scene.dish))
+
+    def _pulse(
+        self, currents: Vector, seconds: float, during: Callable[[], None] = lambda: None, longer: float = 0.0
+    ) -> Pulse:
+        """Give currents; `during` is called once they flow, after which the needle is watched for longer [s]."""
+        self._await_pose(self._now() - BEFORE)
+        self._poses = self._poses[-30:]
+        on, ended = self._now(), ""
+        if currents.any():
+            self._ask_for(currents, seconds)
+            during()
+            on, off, ended = self._await_end(seconds)
+        else:
+            self._wait(seconds)
+            off = self._now()
+        self._await_pose((max(off, self._now()) if longer else off) + max(AFTER, longer))
+        frames = [(stamp, pose) for stamp, pose in self._poses if stamp > on - BEFORE]
+        times, poses = zip(*frames, strict=True)
+        return Pulse(np.array(currents), on, off, np.array(times), np.array(poses), "" if ended == IS_OVER else ended)
+
+    def _ask_for(self, currents: Vector, seconds: float) -> None:
+        """Let the bridge begin a pulse; a needle that has turned fast may have no pose for a moment, and coils rest.
+
+        Raises:
+            GraphError: it is refused for something else, or somebody has stopped or disarmed the bridge.
+        """
+        deadline = time.monotonic() + TIMEOUT
+        for _ in self._given.take():
+            pass
+        while True:
+            request = GivePulse.Request(current=currents.tolist(), duration=seconds)
+            answer = self._ask(Service.PULSE, request)
+            if answer.success:
+                return
+            if time.monotonic() > deadline or not self._wait_for_state().armed:  # somebody wants the coils to stay off
+                refused = self._report(BRIDGE)[1].get("last refusal", "")
+                raise GraphError(answer.message + (f"; refused last: {refused}" if "pose" in answer.message else ""))
+            self._await_pose(self._now())
+
+    def _await_end(self, seconds: float) -> tuple[float, float, str]:
+        """Return when currents began and ended by the bridge's clock [s], and why."""
+        on, deadline = math.nan, time.monotonic() + seconds + PATIENCE
+        while time.monotonic() < deadline:
+            for message, _ in self._given.read():
+                stamp = 1e-9 * reading.nanoseconds(message.header.stamp)
+                if np.any(message.current):
+                    on = stamp if math.isnan(on) else on
+                elif not math.isnan(on):
+                    return on, stamp, message.stop
+            self._turn()
+        raise GraphError(f"{Service.PULSE}: no end of the currents within {seconds + PATIENCE:g} s")
+
+    def _await_pose(self, since: float) -> None:
+        """Wait for a pose of after a time [s]."""
+        end = max(since, self._now()) + PATIENCE
+        while not (self._poses and self._poses[-1][0] > since):
+            if self._now() > end:
+                reason = self._report(TRACKER)[0]
+                raise InvalidInputError("needle", f"no pose for {PATIENCE:g} s: {reason}", "one in every frame")
+            self._turn()
+
+    def _wait(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._turn()
+
+    def _turn(self) -> None:
+        """Take what has come."""
+        self._check()
+        self.spin_some()
+        self._state.poll()
+        for report, _ in self._reports.read():
+            for status in report.status:
+                self._texts[shortened(status.name.split(":")[0])] = read_status(status)
+        for message, _ in self._measured.read():
+            with suppress(InvalidInputError):
+                pose = reading.needle_pose(message)
+                angle = heading_angle(pose.heading)
+                if self._poses:
+                    last = self._poses[-1][1][2]
+                    angle = last + math.remainder(angle - last, math.tau)
+                self._poses.append((pose.stamp, np.array([*pose.tail, angle])))
+        time.sleep(POLL_PERIOD)
+
+    def _report(self, node: str) -> tuple[str, dict[str, str]]:
+        """Return the state of a node and its values, as it reported them."""
+        name = f"{self.node.get_namespace()}/{node}".strip("/")
+        return self._texts.get(name, (f"no {name}", {}))
+
+    def _now(self) -> float:
+        return float(self.node.get_clock().now().nanoseconds) * 1e-9
+
+    def _ask(self, name: str, request: Any) -> Any:
+        """Return the answer of a service, which is called once."""
+        answer = asyncio.run(self._calls.call(name, request, timeout=TIMEOUT, retry_period=math.inf))
+        self._check()
+        return answer
+
+    def _parameters(self, node: str, *names: str) -> list[Any]:
+        return [parameter_value_to_python(value) for value in self._get(node, *names)]
+
+    def _get(self, node: str, *names: str) -> list[Any]:
+        return list(self._ask(f"{node}/{GET}", GetParameters.Request(names=names)).values)
+
+    def _restart(self, node: str, values: Mapping[str, Any]) -> None:
+        """Give a node other parameters, by its lifecycle."""
+        names = [name for name in values if name not in {entry.name for entry in self._before.get(node, ())}]
+        kept = [
+            ParameterMessage(name=name, value=value) for name, value in zip(names, self._get(node, *names), strict=True)
+        ]
+        self._before.setdefault(node, []).extend(kept)
+        self._set(node, [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
+
+    def _restore(self, node: str) -> None:
+        self._set(node, self._before.pop(node))
+
+    def _set(self, node: str, parameters: list[ParameterMessage]) -> None:
+        for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+            self._ask(f"{node}/{CHANGE}", ChangeState.Request(transition=Transition(id=transition)))
+        answer = self._ask(f"{node}/{SET}", SetParametersAtomically.Request(parameters=parameters)).result
+        if not answer.successful:
+            raise GraphError(f"{node}: {answer.reason}")
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            self._change(node, transition)
+        if node == BRIDGE:
+            self._await_driver()
+
+    def _await_driver(self) -> None:
+        """Wait until the bridge can be armed."""
+        deadline = time.monotonic() + TIMEOUT
+        while not self._ready():
+            self._turn()
+            if time.monotonic() > deadline:
+                raise GraphError(f"coil_bridge: {self._report(BRIDGE)[0]}")
+
+    def _ready(self) -> bool:
+        self._state.poll()
+        state = self._state.value
+        return bool(
+            state and state.state == CoilBridgeState.STATE_ACTIVE and state.driver_ready and state.scene_version
+        )
+
+    def _change(self, node: str, transition: int) -> None:
+        """Make a transition of a node.
+
+        Raises:
+            GraphError: it was refused.
+        """
+        if not self._ask(f"{node}/{CHANGE}", ChangeState.Request(transition=Transition(id=transition))).success:
+            self._wait(0.2)  # for the reason, on /diagnostics
+            raise GraphError(f"{node}: {self._report(node)[0]}")
+
+
+@contextmanager
+def _stopped(process: int) -> Iterator[None]:
+    """Let a process stand still."""
+    os.kill(process, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(process, signal.SIGCONT)
