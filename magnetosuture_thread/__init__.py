@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     )
     from magnetosuture_thread.thread.margins import BarrierMargins, Margins
     from magnetosuture_thread.thread.material import MATERIALS, Attachment, Material, Medium, Thread
+    from magnetosuture_thread.thread.paper import PaperOptions
     from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
     from magnetosuture_thread.thread.predictor import ThreadPredictor
 
@@ -40,6 +41,7 @@ _HOME = {
     "evaluation.replay": ("replay_offline",),
     "estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "thread.margins": ("BarrierMargins", "Margins"),
+    "thread.paper": ("PaperOptions",),
     "thread.prediction": ("NeedlePose", "Prediction"),
     "thread.predictor": ("ThreadPredictor",),
     "thread.material": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
@@ -70,6 +72,7 @@ __all__ = [
     "Medium",
     "NeedlePose",
     "NeedleSafetyFilter",
+    "PaperOptions",
     "Polygon",
     "Prediction",
     "Scene",

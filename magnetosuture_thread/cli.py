@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import signal
 import sys
@@ -30,9 +31,11 @@ COMMANDS = {
     "reproduce": "reproduce a result of the paper, simulated",
     "evaluate": "score the thread model on bags, or on reference trajectories",
     "track": "find needle and thread in camera frames, without a graph",
+    "teach": "learn how the needle looks from one frame on which both of its ends are marked",
     "calibrate": "fit the thread's parameters to recorded bags",
     "calibrate-camera": "find where the dish is in the camera's image",
     "calibrate-coils": "find the coils' properties from probe measurements",
+    "commission": "let a rig measure its coils, its needle and its delay",
     "campaign": "run an autonomous procedure in the simulated closed loop, once for each seed",
     "scene": "check a scene file, or draw it",
     "bag": "check a recorded bag, or repair it",
@@ -49,12 +52,12 @@ def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentPa
     Raises:
         ModuleNotFoundError: a package that one of them needs is not installed.
     """
-    parser = argparse.ArgumentParser(prog="magnetosuture")
+    parser = argparse.ArgumentParser(prog="magnetosuture", allow_abbrev=False)
     describe(parser, DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for name, summary in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=summary)
+        subparser = subparsers.add_parser(name, help=summary, allow_abbrev=False)
         if name in names:
             verb, _, kind = name.partition("-")
             module = import_module(f"magnetosuture_thread.commands.{verb}")
@@ -67,8 +70,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
 
     def run() -> int:
-        # A command draws into files. What a notebook asks of its own kernel may not be importable here.
-        os.environ["MPLBACKEND"] = "agg"
         options = make_parser(words[:1]).parse_args(words)
         check_outputs(options)
         return int(options.run(options, Terminal()))
@@ -78,6 +79,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def exit_code(run: Callable[[], int]) -> int:
     """Return the exit code of what runs; an error ends it with one line on standard error."""
+    # A command draws into files. What a notebook asks of its own kernel may not be importable here.
+    os.environ["MPLBACKEND"] = "agg"
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what an encoding lacks, as µ without a locale, ends nothing
     try:
         with _interrupted_by(signal.SIGTERM, signal.SIGHUP):
             return run()

@@ -25,6 +25,7 @@ from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.rig import campaign as run
 from magnetosuture_thread.rig.closed_loop import RunBag
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup
+from magnetosuture_thread.rig.truth import with_rig
 from magnetosuture_thread.settings.errors import BagError, shortened
 from magnetosuture_thread.settings.files import whole_folder
 
@@ -43,6 +44,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--seeds", type=count, default=1, metavar="N", help="runs (default: 1)")
     option("--first-seed", type=first, default=0, metavar="K", help="seed of the first run (default: 0)")
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
+    command.add_rig(parser)
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
     bags = "seeds whose runs are recorded as bags (default: none)"
     option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
@@ -55,7 +57,8 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
 
     Rig, the tracker's noise or the camera and tracker themselves, estimator, planner and coil bridge run in one process
     on simulated time, without ROS; a seed always gives the same run. Each seed varies start, viscosity, bending
-    stiffness, coils, friction and noise; the nodes are told nothing of it. DIR, which must not exist, gets
+    stiffness, coils, friction and noise about the setup's rig, or that of --rig; the nodes are told nothing of it. DIR,
+    which must not exist, gets
       campaign.json   how many runs succeeded, and the figures of each
       campaign.csv    the figures of each run
       campaign.png    the figures of all runs, and the last seconds of those that failed
@@ -67,7 +70,7 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
     procedure = read_procedure(options.procedure)
     if not set(bags) <= set(seeds):
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
-    setup = read_procedure_setup(procedure, options.setup)
+    setup = with_rig(read_procedure_setup(procedure, options.setup), options.rig)
     run.check_run(procedure, setup, run.vary(setup, seeds[0]))
     result = CampaignResult(procedure, setup, options.camera)
     work = partial(_run, procedure, setup, setup.path.read_text(encoding="utf-8"), options.camera)

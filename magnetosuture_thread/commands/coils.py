@@ -30,6 +30,8 @@ def run_coils(options: argparse.Namespace, terminal: Terminal) -> int:
       configure, activate, deactivate, cleanup
                    the lifecycle's transitions
 
+    Arm and reset give up where no bridge is found within 3 s, and count for 1 s from then on.
+
     The same by any ROS 2 tool: services coils/arm (std_srvs/SetBool), coils/emergency_stop and coils/reset
     (std_srvs/Trigger).
     """

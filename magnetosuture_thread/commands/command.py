@@ -66,7 +66,9 @@ def add_actions(
     parsers = []
     for name, run in actions.items():
         summary = (inspect.getdoc(run) or "").partition("\n")[0].rstrip(".")
-        subparser = subparsers.add_parser(name.replace("_", "-"), help=summary[:1].lower() + summary[1:])
+        subparser = subparsers.add_parser(
+            name.replace("_", "-"), help=summary[:1].lower() + summary[1:], allow_abbrev=False
+        )
         runs(subparser, run)
         parsers.append(subparser)
     return parsers
@@ -129,6 +131,12 @@ def add_remap(parser: argparse._ActionsContainer) -> None:
     """Add the option --remap, which may come again; its value is a list of pairs, old name and new."""
     text = "another name for a bag's topic; may come again"
     parser.add_argument("--remap", type=_remap, action="append", default=[], metavar="FROM:=TO", help=text)
+
+
+def add_rig(parser: argparse._ActionsContainer) -> None:
+    """Add the option --rig: the truth of the simulated rig, where it is not as the setup says."""
+    text = "what is simulated: a file with a section for rig_simulator, or random:SEED (default: the setup's)"
+    parser.add_argument("--rig", default="", metavar="TRUTH", help=text)
 
 
 def add_workers(parser: argparse._ActionsContainer, default: int = 1, note: str = "") -> None:

@@ -9,7 +9,7 @@ import struct
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn, Protocol
 
 from aiohttp import WSMsgType, web
@@ -18,6 +18,7 @@ from magnetosuture_thread.console.jog_controller import DelayEstimator, JogContr
 from magnetosuture_thread.console.settings import ConsoleSettings, RateCounter, same_token
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, MagnetosutureError
+from magnetosuture_thread.settings.interface import PRESS_TIMEOUT, STARTS
 
 MAX_MESSAGE_CHARS = 4096
 HELLO_TIMEOUT = 5.0  # after the connection [s]
@@ -27,13 +28,14 @@ MAX_PENDING_REQUESTS = 4  # of one page, besides those of `UNLEASED`
 MAX_UNACKNOWLEDGED = 2  # states in flight, and frames
 # Allowed for every page with the token, with or without control.
 UNLEASED = ("stop", "disarm", "pause procedure", "abort procedure")
+HELD = ("jog", "hold")  # messages that are repeated while something is held
 
 Message = str | bytes
 Reply = Callable[[str, str], None]
 
 
 Field = tuple[type, Quantity]
-_TEXT, _SWITCH, _NUMBER = (str, Quantity("")), (bool, Quantity("")), (float, Quantity(""))
+_TEXT, _SWITCH, _NUMBER = (str, Quantity("")), (bool, Quantity("")), (float, Quantity(""))  # the last also a time
 _PAIR = (tuple, Quantity("", multiple=2))
 
 
@@ -41,12 +43,13 @@ def _one_of(*choices: str) -> Field:
     return str, Quantity("", choices=choices)
 
 
-# What each type of message holds. `sent` is the time of sending by the page's clock [s]. In a greeting, `token` is
-# empty for a page that only watches, and `automated` tells whether a script drives the browser, null for no browser.
-# `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is the receipt of a state or frame.
+# What each type of message holds, besides `sent`: when it was sent, or the button for it pressed, by the page's clock
+# [s]. In a greeting, `token` is empty for a page that only watches, and `automated` tells whether a script drives the
+# browser, null for no browser. `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is
+# the receipt of a state or frame.
 FIELDS: dict[str, dict[str, Field]] = {
     "hello": {"token": _TEXT, "automated": _SWITCH},
-    "jog": {"speed": (float, Quantity("", "m/s", minimum=0.0)), "direction": _PAIR, "sent": _NUMBER},
+    "jog": {"speed": (float, Quantity("", "m/s", minimum=0.0)), "direction": _PAIR},
     "end_jog": {},
     "acknowledge": {"kind": _one_of("state", "frame")},
     "visibility": {"visible": _SWITCH},
@@ -57,7 +60,7 @@ FIELDS: dict[str, dict[str, Field]] = {
     "pause": {"paused": _SWITCH},
     "record": {"recording": _SWITCH},
     "procedure": {"action": _one_of("plan", "resume", "pause", "abort"), "procedure": _TEXT, "hold_to_run": _SWITCH},
-    "hold": {"sent": _NUMBER},
+    "hold": {},
     "tip": {"position": (tuple, Quantity("", "m", multiple=2))},
 }
 
@@ -69,10 +72,12 @@ class ClientMessage:
     Attributes:
         type: one of `FIELDS`.
         values: of its fields by name; of a jog, `velocity` [m/s] in place of direction and speed.
+        sent: when, by the page's clock [s]; None where it does not say, as only what starts something has to.
     """
 
     type: str
     values: Mapping[str, Any] = field(default_factory=dict)
+    sent: float | None = None
 
     @property
     def request(self) -> str:
@@ -80,6 +85,11 @@ class ClientMessage:
         if self.type == "procedure":
             return f"{self.values['action']} procedure"
         return str(self.values["action"]) if self.type == "bridge_action" else self.type
+
+    @property
+    def starts(self) -> bool:
+        """Whether it may let the needle move, and must not come late."""
+        return self.type in HELD or self.values.get("action") in STARTS
 
 
 def parse_client_message(text: str, max_speed: float) -> ClientMessage:
@@ -108,7 +118,13 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
         x, y = direction[0] / largest, direction[1] / largest
         factor = min(speed, max_speed) / max(1.0, math.hypot(x, y))
         values["velocity"] = (x * factor, y * factor)
-    return ClientMessage(kind, values)
+    message = ClientMessage(kind, values)
+    try:
+        return replace(message, sent=_checked("sent", fields.get("sent"), *_NUMBER))
+    except InvalidInputError:
+        if message.starts:
+            raise
+        return message
 
 
 def _checked(name: str, value: Any, kind: type, quantity: Quantity) -> Any:
@@ -447,6 +463,7 @@ class Client:
         if parsed is None or parsed.type != "hello":
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
+        self._lateness(parsed, asyncio.get_running_loop().time())
         self._can_command = self.has_token = same_token(token := parsed.values["token"], self._token)
         # Programs other than browsers name no origin.
         self.is_script = parsed.values["automated"] is not False or not self._request.headers.get("Origin")
@@ -475,13 +492,14 @@ class Client:
         try:
             exceeded = self._count_message(now)
             parsed = self._read(kind, data)
+            late = self._lateness(parsed, now)
             if exceeded and parsed.request != "stop":
                 raise InvalidInputError("messages", f"{self._message_count} in a second", f"at most {MAX_MESSAGE_RATE}")
             if parsed.type == "acknowledge":
                 self._outbox.acknowledge(parsed.values["kind"])
                 self._wake.set()
             else:
-                await self._dispatch(parsed, now)
+                await self._dispatch(parsed, late, now)
         except InvalidInputError as error:
             self._jog.interrupt(self.number)
             self._reply("error", text=str(error))
@@ -501,10 +519,10 @@ class Client:
             expected = "the one in the console's address: this page only watches"
             self._reply("error", text=str(InvalidInputError("token", "none", expected)))
 
-    async def _dispatch(self, message: ClientMessage, now: float) -> None:
+    async def _dispatch(self, message: ClientMessage, late: str, now: float) -> None:
         values, jog = message.values, self._jog
         match message.type:
-            case "jog" if not self._in_time(values["sent"], now):
+            case "jog" if late:
                 jog.interrupt(self.number)
                 if now - self._last_in_time > 1.0:  # s; it must reconnect
                     await self._socket.close(code=1008, message=b"all messages are late")
@@ -512,7 +530,7 @@ class Client:
                 if not jog.jog(self.number, values["velocity"]):
                     self._reply("error", text="jog: this page does not have control; take control first")
             case "hold":
-                if self._in_time(values["sent"], now) and jog.holder == self.number:
+                if not late and jog.holder == self.number:
                     self._requests.hold()
             case "end_jog":
                 jog.end_jog(self.number)
@@ -522,19 +540,27 @@ class Client:
                 jog.release_control(self.number)
             case "visibility":
                 jog.set_visible(self.number, values["visible"])
+            case _ if late:
+                self._report(message.request, late)
             case request if request != "hello":
                 operator = "a script" if self.is_script else "an operator"
                 self._requests.start(self.number, message, operator, self._report)
 
-    def _in_time(self, sent: float, now: float) -> bool:
-        """Return whether a message of a hold is not late; report it else."""
-        delay = self._delay.update(sent, now)
-        if delay <= self._settings.hold_timeout:
+    def _lateness(self, message: ClientMessage, now: float) -> str:
+        """Return why a message comes too late to start anything, empty if it does not; of one of a hold, report it."""
+        if message.sent is None:
+            return ""
+        delay, timeout = self._delay.update(message.sent, now), self._settings.hold_timeout
+        if delay <= timeout:
             self._last_in_time = now
-            return True
-        expected = f"expected at most {self._settings.hold_timeout:g} s"
-        self._reply("error", text=f"jog: computer or network {delay:.2f} s late, {expected}", delay=delay)
-        return False
+        is_held = message.type in HELD
+        limit = timeout if is_held else PRESS_TIMEOUT
+        if delay <= limit or not message.starts:
+            return ""
+        late = f"computer or network {delay:.2f} s late, expected at most {limit:g} s"
+        if is_held:
+            self._reply("error", text=f"jog: {late}", delay=delay)
+        return late
 
     def _count_message(self, now: float) -> bool:
         """Count a message; return whether it exceeds the maximum rate."""

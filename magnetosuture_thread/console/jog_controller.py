@@ -126,8 +126,8 @@ class DeadManSwitch:
 class DelayEstimator:
     """Delay of messages on the network, relative to the fastest one.
 
-    The page's clock has another origin, so the fastest message defines zero delay. A late jog message describes the
-    past and must not move the needle.
+    The page's clock has another origin, so the fastest message defines zero delay. A late message describes the past
+    and must not move the needle.
     """
 
     def __init__(self) -> None:

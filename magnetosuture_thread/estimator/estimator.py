@@ -22,10 +22,10 @@ from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceT
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.settings.configuration import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments, plain
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.thread.margins import SOLID, BarrierMargins, Margins
-from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedlePose, Prediction
+from magnetosuture_thread.thread.prediction import MAX_COORDINATE, TIME, NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.step import ThreadState, WarmStart
@@ -588,7 +588,8 @@ class EstimatorSession:
         problem, but waits too, as poses may have come to a stop; it is refused once a pose says that they have not. One
         that is older than what is kept, of a frame without a pose, or of one that was observed already, is refused.
         """
-        if not np.isfinite(stamp):
+        stamp = plain(stamp)
+        if not TIME.within(stamp):
             return EstimationResult(None, problem=_refusal(stamp, "a finite time [s]"))
         last = self._estimator.predictor.pose
         if last is None or stamp > last.stamp:

@@ -257,7 +257,7 @@ class ThreadModelSettings(
             barriers,
             formulation=self.formulation,
             solver=self.solver,
-            paper=PaperOptions.tuned(weight)._replace(damping=self.paper_damping),
+            paper=replace(PaperOptions.tuned(weight), damping=self.paper_damping),
             fixed_nodes=self.fixed_nodes,
             **{name: getattr(self, name) for name in names},
         )

@@ -17,7 +17,6 @@ from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.rollout import (
     KINDS,
     NEEDLE_MARGIN,
-    NO_SHAPE,
     OBSTACLE_MARGIN,
     WALL_MARGIN,
     DragData,
@@ -36,7 +35,7 @@ from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import PredictorOptions, ThreadPredictor
-from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, NO_SHAPE
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation, StepInput
 from magnetosuture_thread.thread.step import WarmStart
 
@@ -45,7 +44,6 @@ Controller = Callable[[float, Vector, Vector], Vector]
 """Velocity of the tip [m/s] for the time since the start [s], the needle's tail [m] and its heading, shapes (2,)."""
 
 MAX_HORIZON = 60.0  # s
-MAX_STEPS = 20_000
 
 
 @checked_arguments("forecast start", InvalidInputError)
@@ -502,7 +500,7 @@ class ThreadForecaster:
             walk.write_forces(pose[2:], tension[k + 1], pull[k + 1])
             done = k + 1
         instants = done + 1
-        memory = self._contacts(), np.empty((nodes, 2)), np.empty((5, nodes - 1))
+        memory = self._contacts(), np.empty((nodes, 2)), np.empty((6, nodes - 1))
         walked = self._formulation.rod, self._around, vertices[:instants], poses[:instants, 2:].copy()
         if not least_margins(*walked, *memory, margin, margin_nodes, margin_shapes):
             raise InvalidInputError("scene", "more contacts than there is memory for", "fewer shapes")
@@ -552,9 +550,9 @@ class ThreadForecaster:
     def _steps(self, horizon: float) -> int:
         if not bounded("s", 0.5 * self.step, MAX_HORIZON).within(horizon):
             raise InvalidInputError("horizon", horizon, f"a time from one step, {self.step:g} s, to {MAX_HORIZON:g} s")
-        steps = max(1, round(horizon / self.step))
-        if steps > MAX_STEPS:
-            raise InvalidInputError("horizon", f"{steps} steps", f"at most {MAX_STEPS} steps of {self.step:g} s")
+        steps, most = max(1, round(horizon / self.step)), 20_000
+        if steps > most:
+            raise InvalidInputError("horizon", f"{steps} steps", f"at most {most} steps of {self.step:g} s")
         return steps
 
     def _sequence(self, commands: Vector, steps: int) -> Points:

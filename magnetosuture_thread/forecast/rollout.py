@@ -16,13 +16,11 @@ from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceDat
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.barriers import link_margins
 from magnetosuture_thread.thread.mechanics import RodProperties
-from magnetosuture_thread.thread.program import Indices, Mask, Table, Vector
+from magnetosuture_thread.thread.program import NO_SHAPE, Indices, Mask, Table, Vector
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins of a forecast."""
 KINDS = ("obstacle", "wall", "connectivity", "compression", "needle")
-NO_SHAPE = -2
-"""In place of a shape, of a margin that is of none."""
 
 Pair = tuple[float, float]
 
@@ -184,7 +182,7 @@ def least_margins(
         headings: of the needle, shape (k, 2).
         contacts: memory.
         work: memory, shape (n + 1, 2).
-        rows: memory, shape (5, n).
+        rows: memory, shape (6, n).
         margin: written, inf before, shape (k, 5) [m]; see `KINDS`.
         node: written, shape (k, 5).
         shape: written, shape (k, 5).

@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 import inspect
 import re
-from collections.abc import Callable
-from contextlib import suppress
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import event, types
 
 PACKAGE = Path(__file__).parents[1]
 # A module, and the names after `import`, which may be modules too.
@@ -48,20 +49,42 @@ def source_digest(path: Path, package: Path = PACKAGE) -> str:
     return hashlib.sha256(b"".join(_read(file, package)[0] for file in sorted(reached))).hexdigest()
 
 
+@contextmanager
+def _guarded(file: Any) -> Iterator[None]:
+    """Load or save a kernel; a full disk means none in the cache, and an index that a power cut has emptied goes."""
+    try:
+        yield
+    except (EOFError, UnpicklingError):
+        Path(file._index_path).unlink(missing_ok=True)
+    except OSError:
+        pass
+
+
 def _decorator(*, keeps: bool = False, **options: Any) -> Callable[[_Function], _Function]:
     """Return numba's decorator with numpy's rules for division by zero and, but for what is inlined, a cache.
 
     Options are said of every function, as numba takes them over from whatever calls one first where they are not.
     Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
+    A number that is written out has a type of its own in numba, for which a function would be compiled once more.
     """
-    decorator = cast(Any, numba.njit)  # the stubs do not know all options
+    decorator, unliteral = cast(Any, numba.njit), cast(Any, types).unliteral  # the stubs do not know all options
 
     def decorate(function: _Function) -> _Function:
         dispatcher = decorator(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
+        if dispatcher is function:  # as NUMBA_DISABLE_JIT says, for a debugger or a coverage of lines
+            return function
+        resolve = dispatcher.get_call_template
+        dispatcher.get_call_template = lambda types_of, named: resolve(tuple(map(unliteral, types_of)), named)
+        if options.get("no_cpython_wrapper"):
+            # Python's call of it would be a crash, and is one of a function with a wrapper instead.
+            wrapped = cache(lambda: decorator(error_model="numpy", _nrt=options["_nrt"])(function))
+            dispatcher._insert = lambda *given, **named: None
+            dispatcher._compile_for_args = lambda *given, **named: wrapped()
         if keeps:
             # Where neither the package nor the user's cache can be written, each process compiles for itself.
             with suppress(RuntimeError):
                 dispatcher.enable_caching()
+                dispatcher._cache._guard_against_spurious_io_errors = partial(_guarded, dispatcher._cache._cache_file)
                 # numba itself looks at the function's own file only, and would run old code of the others.
                 dispatcher._cache._cache_file._source_stamp = source_digest(Path(inspect.getfile(function)))
         return cast(_Function, dispatcher)
@@ -91,7 +114,7 @@ nor return any, whose references nobody would have counted.
 """
 
 compiled_inner = _decorator(keeps=True, _nrt=False, no_cpython_wrapper=True)
-"""Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash."""
+"""Compile a function as `compiled_uncounted` does, for compiled code: to call it from Python compiles it once more."""
 
 compiled_within = _decorator(inline="always", _nrt=False)
 """Compile a function as a part of the one kernel that calls it, without counting references to arrays.
@@ -132,6 +155,8 @@ class TypedKernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function."""
+        if self._code is None and not hasattr(self._kernel, "compile"):
+            self._code = self._kernel
         if self._code is None:
             signature = tuple(cast(Any, numba).typeof(argument) for argument in arguments)
             self._kernel.compile(signature)
@@ -140,7 +165,7 @@ class TypedKernel:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to make it again by the function's name, for `copy` and `pickle`."""
-        function = self._kernel.py_func
+        function = getattr(self._kernel, "py_func", self._kernel)
         return _typed_kernel, (function.__module__, function.__name__)
 
 

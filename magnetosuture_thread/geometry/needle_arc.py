@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import InvalidInputError
 
+MAX_NORM_ERROR = 0.01  # of unit vectors and quaternions: two decimals of each entry, as a person or a text gives them
+
 
 def needle_axis(
     tail: Points, heading: float, length: float, curvature: float, at: NDArray[np.float64]
@@ -94,14 +96,16 @@ def heading_angle(heading: NDArray[np.float64]) -> float:
 def heading_from_quaternion(x: float, y: float, z: float, w: float, field: str) -> NDArray[np.float64]:
     """Return the unit vector, shape (2,), along the x axis that a unit quaternion turns; `field` is its name.
 
+        [w^2 + x^2 - y^2 - z^2, 2 (x y + w z)],    of length one
+
     Raises:
-        InvalidInputError: it is not a unit quaternion, or turns the x axis out of the dish plane.
+        InvalidInputError: its norm is not one to `MAX_NORM_ERROR`, or it turns the x axis out of the dish plane.
     """
     # Not by squares: Python raises an error for those of what a hostile message may hold.
     size = math.hypot(x, y, z, w)
-    if not abs(size - 1.0) < 1e-3:
-        raise InvalidInputError(field, f"norm {size:g}", "a unit quaternion")
-    along = np.array([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)])
+    if not abs(size - 1.0) <= MAX_NORM_ERROR:
+        raise InvalidInputError(field, f"norm {size:g}", f"a unit quaternion, to {MAX_NORM_ERROR:g}")
+    along = np.array([w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z)])
     length = float(np.linalg.norm(along))
     if length < 1e-3:
         raise InvalidInputError(field, "an upright needle", "an x axis in the dish plane")

@@ -36,7 +36,6 @@ EDGE_WIDTH = 14
 pseudo-normals at start and end (2 each), and one to fill."""
 MIN_DISTANCE = 1e-12
 """At a smaller distance from a vertex or an edge, the direction away from it is lost in rounding [m]."""
-NO_BLOCK, NO_ROW = np.int64(-1), np.int64(0)  # typed: a kernel is compiled again for each number that is written out
 _SAME_POINT = 1e-7  # two rows of one obstacle that differ by less are one point of its boundary
 
 
@@ -334,6 +333,22 @@ def polygon_rows(
     return Nearest(count, best.square, best.signed, best.x, best.y, best.edge, best.block)
 
 
+@compiled_inline
+def _nearest_of_block(
+    x: float, y: float, block: int, data: WorkspaceData, square: float, edge: int
+) -> tuple[float, int]:
+    """Return the least squared distance of a point from the edges of a block, and which; those from before if less."""
+    numbers, first = data.edges, data.ranges[block, 0]
+    for at in range(first, first + data.ranges[block, 1]):
+        k = at * EDGE_WIDTH
+        rx, ry, dx, dy = x - numbers[k], y - numbers[k + 1], numbers[k + 4], numbers[k + 5]
+        along = min(max(rx * dx + ry * dy, 0.0), numbers[k + 6])
+        qx, qy = rx - along * dx, ry - along * dy
+        if qx * qx + qy * qy < square:
+            square, edge = qx * qx + qy * qy, k
+    return square, edge
+
+
 @compiled_inner
 def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceData) -> Nearest:
     """Return the nearest boundary point of a polygon.
@@ -347,21 +362,36 @@ def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceDa
         guess: a block that may be near, which saves looking at others; -1 for none.
         data: packed obstacles.
     """
-    no_rows = ContactRows(data.edges, data.circles)  # of which none is written
-    first, last = data.polygons[polygon, 0], data.polygons[polygon, 1]
-    best = Nearest(0, np.inf, np.inf, 0.0, 0.0, 0, -1)
+    numbers, first, last = data.edges, data.polygons[polygon, 0], data.polygons[polygon, 1]
+    square, k, nearest = np.inf, -1, guess
     if first <= guess < last:
-        best = search_block(x, y, -1.0, guess, data, NO_ROW, NO_ROW, no_rows)
-    reach = math.sqrt(best.square)
+        square, k = _nearest_of_block(x, y, nearest, data, square, k)
+    reach = math.sqrt(square)
     for block in range(first, last):
         dx, dy = x - data.circles[block, 0], y - data.circles[block, 1]
         far = reach + data.circles[block, 2]
         if block == guess or dx * dx + dy * dy >= far * far:
             continue
-        found = search_block(x, y, -1.0, block, data, NO_ROW, NO_ROW, no_rows)
-        if found.square < best.square:
-            best, reach = found, math.sqrt(found.square)
-    return best
+        less, edge = _nearest_of_block(x, y, block, data, square, k)
+        if edge != k:
+            square, k, nearest, reach = less, edge, block, math.sqrt(less)
+    if k < 0:  # of a point that is not finite
+        return Nearest(0, np.inf, np.inf, 0.0, 0.0, 0, -1)
+    rx, ry, dx, dy = x - numbers[k], y - numbers[k + 1], numbers[k + 4], numbers[k + 5]
+    along = rx * dx + ry * dy
+    if 0.0 < along < numbers[k + 6]:
+        side = rx * dy - ry * dx
+        sign = 1.0 if side >= 0.0 else -1.0
+        return Nearest(0, side * side, sign * abs(side), dy, -dx, k, nearest)
+    # A vertex: the start or the end, whose pseudo-normal tells the side.
+    nx, ny = numbers[k + 9], numbers[k + 10]
+    if along > 0.0:
+        rx, ry, nx, ny = x - numbers[k + 2], y - numbers[k + 3], numbers[k + 11], numbers[k + 12]
+    square = rx * rx + ry * ry
+    length, sign = math.sqrt(square), 1.0 if rx * nx + ry * ny >= 0.0 else -1.0
+    if length > MIN_DISTANCE:
+        nx, ny = sign * rx / length, sign * ry / length
+    return Nearest(0, square, sign * length, nx, ny, k, nearest)
 
 
 @compiled_inner
@@ -385,7 +415,7 @@ def shape_distance(x: float, y: float, s: int, guess: int, data: WorkspaceData) 
     return found.signed, found.x, found.y, found.block
 
 
-@compiled
+@compiled_uncounted
 def measure(points: Points, data: WorkspaceData, distances: Points, normal: NDArray[np.float64]) -> None:
     """Write the signed distance of each point from each disc, then polygon, (m, s), and its gradient, (m, s, 2)."""
     for s in range(distances.shape[1]):
@@ -601,15 +631,13 @@ def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: Wor
     length, edges = math.hypot(bx - ax, by - ay), data.edges
     intervals = np.empty((64, 2))  # halved depth first
     intervals[0, 0], intervals[0, 1], pending, halvings = 0.0, 1.0, 1, 0
-    best = min(
-        nearest_edge(ax, ay, polygon, NO_BLOCK, data).signed, nearest_edge(bx, by, polygon, NO_BLOCK, data).signed
-    )
+    best = min(nearest_edge(ax, ay, polygon, -1, data).signed, nearest_edge(bx, by, polygon, -1, data).signed)
     lowest = best
     while pending > 0:
         pending -= 1
         low, high = intervals[pending, 0], intervals[pending, 1]
         px, py, qx, qy = ax + low * (bx - ax), ay + low * (by - ay), ax + high * (bx - ax), ay + high * (by - ay)
-        before, after = nearest_edge(px, py, polygon, NO_BLOCK, data), nearest_edge(qx, qy, polygon, NO_BLOCK, data)
+        before, after = nearest_edge(px, py, polygon, -1, data), nearest_edge(qx, qy, polygon, -1, data)
         best = min(best, before.signed, after.signed)
         bound = 0.5 * (before.signed + after.signed - (high - low) * length)
         for k in (before.edge, after.edge):
@@ -634,20 +662,19 @@ def _from_polygon(
     Outside it is that of a, that of b from an edge, or that of a corner of the polygon from the line.
     """
     ux, uy, edges, least = bx - ax, by - ay, data.edges, signed * signed if signed > TOLERANCE else 0.0
-    scale = 1.0 / max(ux * ux + uy * uy, 1e-300)
-    # What is farther from a than this is farther from the line than a is from the polygon.
-    far = signed + math.sqrt(ux * ux + uy * uy)
+    scale, nearest = 1.0 / max(ux * ux + uy * uy, 1e-300), math.sqrt(least)
     for block in range(data.polygons[polygon, 0], data.polygons[polygon, 1]):
-        rx, ry, reach = data.circles[block, 0] - ax, data.circles[block, 1] - ay, data.circles[block, 2] + far
-        if least == 0.0 or rx * rx + ry * ry > reach * reach:
+        rx, ry, reach = data.circles[block, 0] - ax, data.circles[block, 1] - ay, data.circles[block, 2] + nearest
+        t = min(max((rx * ux + ry * uy) * scale, 0.0), 1.0)
+        # A block that is farther from the line than the nearest so far has no edge that is nearer.
+        if least == 0.0 or (rx - t * ux) ** 2 + (ry - t * uy) ** 2 > reach * reach:
             continue
         first = data.ranges[block, 0]
         for k in range(first * EDGE_WIDTH, (first + data.ranges[block, 1]) * EDGE_WIDTH, EDGE_WIDTH):
             dx, dy = edges[k + 4], edges[k + 5]
             rx, ry, qx, qy = edges[k] - ax, edges[k + 1] - ay, bx - edges[k], by - edges[k + 1]
-            if rx * rx + ry * ry <= far * far:
-                t = min(max((rx * ux + ry * uy) * scale, 0.0), 1.0)
-                least = min(least, (rx - t * ux) ** 2 + (ry - t * uy) ** 2)
+            t = min(max((rx * ux + ry * uy) * scale, 0.0), 1.0)
+            least = min(least, (rx - t * ux) ** 2 + (ry - t * uy) ** 2)
             before, after = ry * dx - rx * dy, qx * dy - qy * dx  # how far a and b are from the edge's line, outwards
             if 0.0 < qx * dx + qy * dy < edges[k + 6]:
                 least = min(least, after * after)
@@ -655,8 +682,8 @@ def _from_polygon(
                 sx, sy = edges[k + 2] - ax, edges[k + 3] - ay
                 if (rx * uy - ry * ux) * (sx * uy - sy * ux) < 0.0:
                     least = 0.0  # they cross
-    outside = math.sqrt(least)
-    return outside if outside > TOLERANCE else _deepest(ax, ay, bx, by, polygon, data)
+        nearest = math.sqrt(least)
+    return nearest if nearest > TOLERANCE else _deepest(ax, ay, bx, by, polygon, data)
 
 
 @compiled_inner

@@ -35,14 +35,8 @@ VERSION_CHARS = 16
 WALL_NAME = "wall"  # in place of that of a shape
 
 
-def is_number(value: Any) -> bool:
-    """Return whether a value is a finite number, and not a boolean."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # a whole number beyond any float
-        return False
+is_number = bounded().within
+"""Return whether a value is a finite number, and not a boolean."""
 
 
 @checked_arguments("dish")

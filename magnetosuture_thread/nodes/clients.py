@@ -15,7 +15,6 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
-import rclpy
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.action import ExecuteProcedure
@@ -35,8 +34,9 @@ from magnetosuture_thread.bags.reading import constant_name
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, read_status
+from magnetosuture_thread.nodes.parameters import start_ros
 from magnetosuture_thread.settings.errors import GraphError, shortened
-from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, Service
+from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, STARTS, Service
 
 TIMEOUT = 10.0  # s for a service to be found and to answer
 POLL_PERIOD = 0.005  # s between two looks at what has come
@@ -50,6 +50,7 @@ ACTIONS: dict[str, tuple[Service, Any]] = {
     "reset": (Service.RESET, Trigger.Request()),
 }
 """What switches the coil bridge: service and request."""
+FIND_TIMEOUT = 3.0  # s in which nodes have found each other, on a busy machine too
 CHANGE_STATE = "coil_bridge/change_state"
 
 
@@ -72,7 +73,7 @@ class Participant(ExitStack):
     ) -> None:
         super().__init__()
         context, no_handlers = Context(), SignalHandlerOptions.NO
-        rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=no_handlers)
+        start_ros(context, domain_id=domain, args=[], signal_handler_options=no_handlers)
         self.callback(context.try_shutdown)
         values = {"start_type_description_service": False, "use_sim_time": simulated_clock}
         parameters = [Parameter(key, value=value) for key, value in values.items()]
@@ -208,6 +209,7 @@ class Services:
         *,
         timeout: float = TIMEOUT,
         retry_period: float = 0.5,
+        call_within: float = math.inf,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> Any:
         """Return the answer of a service; None where it is not wanted any more.
@@ -219,6 +221,7 @@ class Services:
             request: to it.
             timeout: for it to be found and to answer [s].
             retry_period: without an answer, after which it is called again [s].
+            call_within: after which it is not called any more [s].
             is_wanted: whether to go on waiting.
 
         Raises:
@@ -226,18 +229,20 @@ class Services:
         """
         client = self._clients[name]
         calls: list[Future] = []
-        deadline, retry_at = time.monotonic() + timeout, 0.0
-        while (now := time.monotonic()) < deadline:
+        began, retry_at = time.monotonic(), 0.0
+        last_call, deadline = began + call_within, began + timeout
+        while (now := time.monotonic()) < (deadline if calls else min(deadline, last_call)):
             if not is_wanted():
                 return None
-            if now >= retry_at and client.service_is_ready():
+            if retry_at <= now < last_call and client.service_is_ready():
                 calls.append(client.call_async(request))
                 retry_at = now + retry_period
             await asyncio.sleep(POLL_PERIOD)
             self._node.executor.spin_some()
             if answers := [call.result() for call in calls if call.done()]:
                 return answers[0]
-        raise GraphError(f"{f'{name} did not answer' if calls else f'no service {name}'} within {timeout:g} s")
+        problem = f"{name} did not answer within {timeout:g} s"
+        raise GraphError(problem if calls else f"no service {name} within {min(timeout, call_within):g} s")
 
 
 class CoilClient(Participant):
@@ -264,7 +269,7 @@ class CoilClient(Participant):
         """
         message = ""
         if action in ACTIONS:
-            answer = self._call(*ACTIONS[action])
+            answer = self._call(*ACTIONS[action], call_within=FIND_TIMEOUT if action in STARTS else math.inf)
             message = shortened(answer.message, MAX_REASON_CHARS)
             if not answer.success:
                 raise GraphError(message)
@@ -360,7 +365,7 @@ class ProcedureClient:
     """
 
     def __init__(self, node: Node, procedure: str) -> None:
-        self._request = ExecuteProcedure.Goal(procedure=procedure)
+        self._node, self._request = node, ExecuteProcedure.Goal(procedure=procedure)
         self._send_at: float | None = None  # None until the planner is found, infinite while it executes the goal
         self._client = ActionClient(node, ExecuteProcedure, EXECUTE_PROCEDURE)
         self.status: ProcedureState | None = None
@@ -374,7 +379,7 @@ class ProcedureClient:
             if self._client.server_is_ready():
                 self._send_at = now + DISCOVERY_TIME
         elif now >= self._send_at:
-            self._send_at = math.inf
+            self._send_at, self._request.stamp = math.inf, self._node.get_clock().now().to_msg()
             sent = self._client.send_goal_async(self._request, self._on_feedback)
             sent.add_done_callback(lambda sent: sent.result().get_result_async().add_done_callback(self._on_result))
 

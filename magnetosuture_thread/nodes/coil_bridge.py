@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import socket
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +15,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
+from magnetosuture_msgs.srv import GivePulse
 from rclpy.node import Node
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
@@ -22,6 +24,7 @@ from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOu
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.latch import StopRecord
+from magnetosuture_thread.coils.pulses import PulseBridge
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
@@ -30,7 +33,7 @@ from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
 
 # Keys of the report on /diagnostics.
-SCHEDULING = "scheduling"
+SCHEDULING, PROCESS = "scheduling", "process"
 JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
 AGED = (*INPUTS.values(), topics.NEEDLE_POSE.name)  # inputs whose least age is reported
 
@@ -39,7 +42,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     """Drives the coils by filtered velocity commands while active and armed, and with zeros otherwise.
 
     Every command passes the needle's safety filter: those of an operator on `operator/servo_cv`, which have priority,
-    and those of a planner or path follower on `needle/servo_cv`.
+    and those of a planner or path follower on `needle/servo_cv`. While a rig is commissioned pulses are given instead.
     """
 
     stands_by = False  # it reports what it does, in any state
@@ -66,9 +69,12 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source), self._step)
-        self.serve(Service.ARM, lambda request, answer: _done(answer, self.arm(request.data)))
+        self.serve(
+            Service.ARM, lambda request, answer: _done(answer, self.arm(request.data)), lambda request: request.data
+        )
         self.serve(Service.EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
-        self.serve(Service.RESET, lambda _, answer: _done(answer, self.reset()))
+        self.serve(Service.RESET, lambda _, answer: _done(answer, self.reset()), lambda _: True)
+        self.serve(Service.PULSE, lambda request, answer: _done(answer, self.pulse(request)), lambda _: True)
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
@@ -78,7 +84,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self.system.check_barriers(settings.barriers)
         self.system.recall(stop_record(self))
         self.system.remember()
-        bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
+        kind = PulseBridge if settings.commissioning else CoilBridge
+        bridge = kind(settings, self.system.latch, self._scene.load(settings.scene))
         driver = make_driver(settings, len(bridge.coils), self._send_to_rig, self._count_rigs)
         self.system.open(settings, bridge, driver)
         self.every(1.0 / settings.rate, self.on_watchdog)  # also while simulated time stands still
@@ -130,6 +137,18 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._step()
         return ""
 
+    def pulse(self, request: GivePulse.Request) -> str:
+        """Give currents for a while."""
+        bridge = self.system.bridge
+        if not isinstance(bridge, PulseBridge):
+            raise InvalidInputError(
+                Service.PULSE, "a bridge that does not commission", "coil_bridge.commissioning true"
+            )
+        currents = np.asarray(request.current, dtype=float)
+        bridge.pulse(currents, request.duration, *self._times(), self.system.driver_state)
+        self._step()
+        return ""
+
     def on_pose(self, message: PoseWithCovarianceStamped, number: int) -> None:
         """Register a needle pose, for the next currents."""
         if self.system.bridge is not None:
@@ -172,7 +191,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
         """Do the work of this node at the real-time priority of its loop."""
         scheduling = raise_priority((self.settings or CoilBridgeSettings()).realtime_priority)
-        self.health.note(**{SCHEDULING: scheduling})
+        self.health.note(**{SCHEDULING: scheduling, PROCESS: f"{socket.gethostname()} {os.getpid()}"})
         self.get_logger().info(f"{SCHEDULING}: {scheduling}")
         super().spin(executor, is_over)
 

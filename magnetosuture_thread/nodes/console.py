@@ -78,7 +78,8 @@ class ConsoleGraph:
         self.node = node
         self.blocked = ""
         offered_by = ("coil_bridge", interface.PLANNER, "replay", RIG)
-        self.services = Services(node, {name: name.type_name for name in interface.Service if name.node in offered_by})
+        pressed = (name for name in interface.Service if name.node in offered_by and name != interface.Service.PULSE)
+        self.services = Services(node, {name: name.type_name for name in pressed})
         self._action = 0  # number of the latest
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
@@ -120,7 +121,7 @@ class ConsoleGraph:
         if self.blocked:
             return self.blocked
         if action != "plan":
-            return await self.call(interface.SERVICES[f"procedure/{action}"], Trigger.Request())
+            return await self._press(action, interface.SERVICES[f"procedure/{action}"], Trigger.Request())
         request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
         # A long way takes some seconds, and is planned once.
         return await self.call(interface.Service.PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)
@@ -136,7 +137,12 @@ class ConsoleGraph:
             return self.blocked
         self._action += 1
         number = self._action
-        return await self.call(*ACTIONS[action], is_wanted=lambda: number == self._action)
+        return await self._press(action, *ACTIONS[action], is_wanted=lambda: number == self._action)
+
+    async def _press(self, action: str, name: str, request: Any, **options: Any) -> str:
+        """Call a service, as `call`, for as long as what was pressed counts."""
+        within = interface.PRESS_TIMEOUT if action in interface.STARTS else math.inf
+        return await self.call(name, request, call_within=within, **options)
 
     async def call(self, name: str, request: Any, **options: Any) -> str:
         """Call a service; return an empty text, the reason of a refusal, or what is wrong all the same."""

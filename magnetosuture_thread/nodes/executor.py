@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from typing import Any
 
 from rclpy.event_handler import EventHandler
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, await_or_execute
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Task
@@ -161,6 +161,19 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
     def _take_timer(self, timer: Any) -> Any:
         """Take a timer, unless one that was called before it in this turn has cancelled it."""
         return super()._take_timer(timer) if timer.handle.is_timer_ready() else None
+
+    def _take_service(self, service: Any) -> Any:
+        """Take a request, as rclpy does; the service keeps when it was sent [ns], by the middleware of its client."""
+        with suppress(rclpy_implementation.InvalidHandle), service.handle:  # else it was destroyed by another thread
+            request, header = service.handle.service_take_request(service.srv_type.Request)
+
+            async def execute() -> None:
+                service.sent = header.source_timestamp
+                answer = await await_or_execute(service.callback, request, service.srv_type.Response())
+                service.send_response(answer, header)
+
+            return None if header is None else execute
+        return None
 
     def _resume_tasks(self) -> bool:
         """Begin or resume tasks; return whether one has ended, for which others may wait."""

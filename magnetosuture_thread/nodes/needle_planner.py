@@ -27,7 +27,7 @@ from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, ManagedNode, SceneFollower, reason_of
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, ManagedNode, SceneFollower, check_pressed, reason_of
 from magnetosuture_thread.nodes.parameters import settings_of
 from magnetosuture_thread.planning import session
 from magnetosuture_thread.planning.executor import ProcedureState
@@ -81,10 +81,10 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
         self.serve(interface.Service.PLAN_PROCEDURE, self.on_plan)
         for service, execute in (
             (interface.Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person")),
-            (interface.Service.RESUME_PROCEDURE, self.resume_procedure),
             (interface.Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person")),
         ):
             self.serve(service, partial(self._serve, execute))
+        self.serve(interface.Service.RESUME_PROCEDURE, partial(self._serve, self.resume_procedure), lambda _: True)
         self._action = ProcedureAction(self)
         self.every(PERIOD, self.while_active(self.on_timer))
 
@@ -105,17 +105,19 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
             self.abort(f"the needle planner {'has ended' if self.is_shutting_down else 'was deactivated'}")
 
     def execute(self, request: Any) -> None:
-        """Plan and begin a procedure; raise a `MagnetosutureError` where that cannot be."""
+        """Plan and begin a procedure; raise a `MagnetosutureError` where that cannot be, or the request is late."""
         self.require_active()
+        if pressed := reading.seconds(request.stamp):
+            check_pressed(interface.EXECUTE_PROCEDURE, pressed, self.get_clock().now().nanoseconds * 1e-9)
         self._check_bridge()
         self._plan(request)
-        self._session.resume()
+        self._session.resume(time.monotonic())
         self._publish()
 
     def resume_procedure(self) -> bool:
         """Begin what is planned, or go on; raise an `InvalidInputError` where that cannot be."""
         self._check_bridge()
-        self._session.resume()
+        self._session.resume(time.monotonic())
         return True
 
     def abort(self, reason: str) -> None:

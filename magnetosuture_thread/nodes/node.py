@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import threading
+import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -76,6 +77,8 @@ class Health:
         self._values: dict[str, object] = {}
         self._sent = -1.0
         node.create_timer(PERIOD, self.publish, clock=self._clock)
+        node.create_timer(PERIOD, self._check_types, clock=self._clock)
+        self._other_types: set[str] = set()
         self._late = node.create_timer(self.quiet, self.publish, clock=self._clock)
         self._late.cancel()
 
@@ -154,6 +157,21 @@ class Health:
     warn = partialmethod(report, DiagnosticStatus.WARN)
     error = partialmethod(report, DiagnosticStatus.ERROR)
 
+    def _check_types(self) -> None:
+        """Report once what is published in another type on a topic of the node: the middleware drops it unsaid."""
+        types, own = dict(self._node.get_topic_names_and_types()), {}
+        for subscription in self._node.subscriptions:
+            package, kind, *_ = subscription.msg_type.__module__.split(".")
+            own[subscription.topic_name] = f"{package}/{kind}/{subscription.msg_type.__name__}"
+        for topic, name in own.items():
+            for other in self._node.get_publishers_info_by_topic(topic) if len(types.get(topic, ())) > 1 else ():
+                publisher = f"{other.topic_type} from {other.node_namespace.rstrip('/')}/{other.node_name}"
+                problem = InvalidInputError(topic, publisher, name)
+                if other.topic_type != name and str(problem) not in self._other_types and len(self._other_types) < 100:
+                    self._other_types.add(str(problem))
+                    self._node.get_logger().warning(reason_of(problem))
+                    self.refuse(problem)
+
     def _publish_soon(self) -> None:
         if self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
             self.publish()
@@ -209,10 +227,29 @@ class GuardedNode(Node):
     def finish(self) -> None:
         """Publish what others must know before the node ends in order; the graph is still there."""
 
-    def serve(self, service: interface.Service, callback: Callable[[Any, Any], Any]) -> Service:
-        """Offer a service, whose callback may raise."""
-        answer = partial(_answer, self.get_logger(), service, callback)
-        return self.create_service(topics.ros_class(service.type_name), service, answer)
+    def serve(
+        self,
+        service: interface.Service,
+        callback: Callable[[Any, Any], Any],
+        starts: Callable[[Any], bool] = lambda request: False,
+    ) -> Service:
+        """Offer a service.
+
+        Args:
+            service: to offer.
+            callback: returns the answer; it may raise.
+            starts: whether a request may let the needle move, and is refused where it comes late.
+        """
+
+        def in_time(request: Any, answer: Any) -> Any:
+            if starts(request) and offered.sent:  # set by `KeptWaitSetExecutor` alone
+                check_pressed(service, offered.sent * 1e-9, time.time())
+            return callback(request, answer)
+
+        answer = partial(_answer, self.get_logger(), service, in_time)
+        offered: Any = self.create_service(topics.ros_class(service.type_name), service, answer)
+        offered.sent = 0
+        return offered
 
     def every(self, period: float, callback: Callable[[], None]) -> None:
         """Call back each period [s] of a steady clock: simulated time may stand still."""
@@ -225,6 +262,21 @@ class GuardedNode(Node):
         if msg_type is ClockMessage and not options.get("raw"):
             options["raw"], callback = True, partial(_take_clock, ref(self), callback)
         return super().create_subscription(msg_type, topic, callback, *arguments, **options)
+
+
+def check_pressed(what: str, pressed: float, now: float) -> None:
+    """Refuse what a person has pressed too long ago, or by a clock that is ahead by as much.
+
+    Args:
+        what: was pressed.
+        pressed: when [s].
+        now: the same clock now [s].
+
+    Raises:
+        InvalidInputError: it does not count any more.
+    """
+    if abs(now - pressed) > interface.PRESS_TIMEOUT:
+        raise InvalidInputError(what, f"a request {now - pressed:.1f} s old", f"at most {interface.PRESS_TIMEOUT:g} s")
 
 
 def _take_clock(node: Callable[[], Any], callback: Callable[[ClockMessage], None], data: bytes) -> None:

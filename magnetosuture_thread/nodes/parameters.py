@@ -24,7 +24,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
 
-from magnetosuture_thread import ConfigurationError
+from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.settings.configuration import (
     ROS_PARAMETERS,
     Configuration,
@@ -58,14 +58,28 @@ def init(arguments: Sequence[str] | None = None, context: Context | None = None,
 
     Raises:
         ConfigurationError: a parameter file does not exist, or is none.
+        MagnetosutureError: see `start_ros`.
     """
     line = list(sys.argv if arguments is None else arguments)
     for flag, value in _flags(line):
         if flag == "--params-file":
             read_sections(Path(value))
     context = context or get_default_context()
-    rclpy.init(args=line, context=context, **options)
+    start_ros(context, args=line, **options)
     _ARGUMENTS[context] = line
+
+
+def start_ros(context: Context, **options: Any) -> None:
+    """Initialise a context as `rclpy.init` does.
+
+    Raises:
+        MagnetosutureError: ROS cannot start, as where its folder for logs cannot be written.
+    """
+    try:
+        rclpy.init(context=context, **options)
+    except RuntimeError as error:  # rclpy's own kinds of it are private
+        remedy = "; set ROS_LOG_DIR to a folder that can be written" if "logging" in str(error) else ""
+        raise MagnetosutureError(f"{error}{remedy}") from None
 
 
 def declare(node: Node, cls: type[C], options: Mapping[str, Any], fixed: Mapping[str, str] | None = None) -> C:

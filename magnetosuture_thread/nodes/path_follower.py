@@ -74,8 +74,9 @@ class PathFollowerNode(ManagedNode[PathFollowerSettings]):
             self.health.warn(some if subscribers else "no subscriber to velocity commands")
             return
         pose = reading.needle_pose(message)
-        reading.check_pose_age(pose.stamp, self.get_clock().now().nanoseconds * 1e-9, settings.pose_timeout)
-        command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
+        now = self.get_clock().now().nanoseconds * 1e-9
+        reading.check_pose_age(pose.stamp, now, settings.pose_timeout)
+        command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading, max(0.0, now - pose.stamp))
         self._command(command.velocity)
         if 0.0 < command.progress < 1.0:
             self._setpoints.publish(packed_pose_stamped(message.header.stamp, command.tip, 0.0))

@@ -198,9 +198,10 @@ class RigSimulatorNode(GuardedNode):
         """Publish a frame with its stamp [ns]; the ground truth is published also for a lost frame."""
         if frame.image is not None:
             camera, jpeg = self.rig.camera, encode_jpeg(frame.image, self._settings.jpeg_quality)
-            self._show(camera_outputs(stamp, jpeg, camera.size, camera.view, self._settings.camera_distance))
+            seen = stamp + round(1e9 * frame.stamp_delay)
+            self._show(camera_outputs(seen, jpeg, camera.size, camera.view, self._settings.camera_distance))
             if self._raw.get_subscription_count():
-                self._raw.publish(packed_image(stamp, frame.image))
+                self._raw.publish(packed_image(seen, frame.image))
         self._reveal(ground_truth_outputs(stamp, frame))
 
     def _fail(self, error: MagnetosutureError) -> None:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from functools import cache, wraps
+from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -96,6 +97,7 @@ class Quantity:
         Raises:
             ConfigurationError: it is of another type, or out of bounds.
         """
+        value = plain(value)
         entries = value if kind is tuple else [value]
         is_list = isinstance(entries, Sequence) and not isinstance(entries, str) and len(entries) % self.multiple == 0
         if not is_list or not all(self._fits(part, entry if kind is tuple else kind) for part in entries):
@@ -106,10 +108,11 @@ class Quantity:
         """Return whether a value, or an entry of a list, is of a kind and accepted."""
         if kind in (str, bool):
             return isinstance(value, kind) and (not self.choices or value in self.choices)
-        return self.within(value) and (kind is float or isinstance(value, int))
+        return self.within(value) and (kind is float or isinstance(value, Integral))
 
     def within(self, number: Any) -> bool:
         """Return whether something is a number, finite and within the bounds."""
+        number = plain(number)
         if not _is_number(number):
             return False
         finite = abs(number) <= sys.float_info.max  # not nan, and no whole number beyond any float
@@ -165,6 +168,17 @@ class ConfigurationField:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def plain(value: Any) -> Any:
+    """Return a number, or an array, of numpy or another library as numbers of Python; anything else as it is."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(value, (int, float)) or not isinstance(value, Real):
+        return value
+    try:
+        return float(value)
+    except OverflowError:  # beyond any bound, which no float tells
+        return math.trunc(value)
 
 
 def _read_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
@@ -242,8 +256,7 @@ def _checker(hint: Any) -> Callable[[str, Any], Any] | None:
         may_be_number = not lists or len(kinds) > 1
 
         def check_number(name: str, value: Any) -> Any:
-            value = value.tolist() if hasattr(value, "tolist") else value
-            if lists and not (may_be_number and isinstance(value, (int, float))):
+            if lists and not (may_be_number and _is_number(plain(value))):
                 return quantity.checked(name, value, tuple, entry)
             return quantity.checked(name, value, kind)
 

@@ -136,6 +136,9 @@ GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
 #: what the simulated thread exerts on the needle at its tail, in the frame of the dish
 GROUND_TRUTH_PULL = Channel("ground_truth/thread_pull", "geometry_msgs/msg/WrenchStamped")
 
+STARTS = ("arm", "reset", "resume")  # what a person presses that may let the needle move, and that must not come late
+PRESS_TIMEOUT = 1.0  # s for which it counts: then the person has looked again
+
 EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs
 
 
@@ -153,12 +156,14 @@ class Service(str, Enum):
         service._value_, service.type_name, service.node = name, type_name, node
         return service
 
-    #: arm, or disarm
+    #: arm, unless the request comes late, or disarm
     ARM = "coils/arm", "std_srvs/srv/SetBool", "coil_bridge"
     #: zero currents at once, latched
     EMERGENCY_STOP = "coils/emergency_stop", "std_srvs/srv/Trigger", "coil_bridge"
-    #: clear a stop or a fault; it stays disarmed
+    #: clear a stop or a fault, unless the request comes late; it stays disarmed
     RESET = "coils/reset", "std_srvs/srv/Trigger", "coil_bridge"
+    #: give coils currents for at most 0.5 s, where coil_bridge.commissioning is on, unless the request comes late
+    PULSE = "coils/pulse", "magnetosuture_msgs/srv/GivePulse", "coil_bridge"
     #: take another scene
     LOAD_SCENE = "scene/load", "magnetosuture_msgs/srv/LoadScene", SCENE_SERVER
     #: add a shape to the scene
@@ -173,7 +178,7 @@ class Service(str, Enum):
     PLAN_PROCEDURE = "procedure/make_plan", "magnetosuture_msgs/srv/PlanProcedure", PLANNER
     #: pause the procedure
     PAUSE_PROCEDURE = "procedure/pause", "std_srvs/srv/Trigger", PLANNER
-    #: begin what is planned, or go on
+    #: begin what is planned, or go on, unless the request comes late
     RESUME_PROCEDURE = "procedure/resume", "std_srvs/srv/Trigger", PLANNER
     #: give the procedure up
     ABORT_PROCEDURE = "procedure/abort", "std_srvs/srv/Trigger", PLANNER

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -203,12 +203,15 @@ def key_matches(key: str, node: str) -> bool:
     return re.fullmatch(pattern, node) is not None
 
 
-def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
+def load_setup(
+    path: Path, classes: Sequence[type[Configuration]], only: Collection[str] | None = None
+) -> dict[str, Any]:
     """Read a setup: a ROS 2 parameter file with shared parameters under `/**` and a section for each node.
 
     Args:
         path: the YAML file.
         classes: the nodes' configuration classes; the `GROUP` of each is the name that its section's key ends in.
+        only: groups to return, others being known only; None for all.
 
     Returns:
         A configuration object for each class, by its `GROUP`; what no section gives keeps its default.
@@ -237,7 +240,9 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
             if above and "*" not in above and above != (space := space or above):
                 raise ConfigurationError(key, above, f"one namespace in a setup, as {space} before")
             values[group].update(section)
-        return {group: from_mapping(cls, values[group]) for group, cls in known.items()}
+        return {
+            group: from_mapping(cls, values[group]) for group, cls in known.items() if only is None or group in only
+        }
 
 
 def names_of(cls: type[Configuration]) -> set[str]:

@@ -111,7 +111,6 @@ def substitute(axes: Axes, band: Table, x: Vector) -> None:
         x[j] = value
 
 
-MAX_WEIGHT = 1e7  # w_max over the scale of P: the least compliance that is exact at once
 STATUS = ("solved", "iteration limit", "not positive definite", "not finite", "stalled", "solved, after a cold start")
 SOLVED, LIMIT, INDEFINITE, NOT_FINITE, STALLED, RESTARTED = range(6)
 
@@ -405,7 +404,7 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
             stiffness = max(stiffness, program.blocks[i, a, a])
             if program.known[i]:
                 u[i, a] = 0.0
-    stiffest = MAX_WEIGHT * max(1.0, 1e-4 * stiffness)
+    stiffest = 1e7 * max(1.0, 1e-4 * stiffness)  # w_max by the scale of P; a lesser compliance is not exact at once
     evaluate(axes, program, u, smooth, image)
     for r in range(len(lower)):
         weights[r] = 1.0 / max(compliance[r], 1.0 / stiffest)

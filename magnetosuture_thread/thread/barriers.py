@@ -146,14 +146,14 @@ class Compression(_DistanceBarrier):
 
 @compiled_uncounted
 def link_margins(rod: RodProperties, points: Points, heading: Points, work: Points, rows: Table) -> None:
-    """Write value and clearance of connectivity, then of compression, and the chords that the segments keep.
+    """Write value and clearance of connectivity and of compression, the chords that the segments keep, and the strain.
 
     Args:
         rod: the thread.
         points: nodes, shape (n + 1, d) [m].
         heading: unit vector along the needle, shape (d,).
         work: memory, shape (n + 1, d).
-        rows: written, shape (5, n) [m^2], [m], [m^2], [m], [m].
+        rows: written, shape (6, n) [m^2], [m], [m^2], [m], [m], [1].
     """
     for i in range(len(points)):
         for a in range(points.shape[1]):
@@ -165,6 +165,7 @@ def link_margins(rod: RodProperties, points: Points, heading: Points, work: Poin
         pressed, _ = distance_row(points, i, i + 1, chord)
         rows[0, i], rows[1, i] = stretched, rod.unit - length
         rows[2, i], rows[3, i], rows[4, i] = -pressed, length - chord, chord
+        rows[5, i] = rows[3, i] / chord
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,7 @@ def solid_rows(
         points: nodes, shape (n + 1, d) [m].
         around: obstacles and wall.
         radius: of the thread [m].
-        nearby: block of each shape that is near the last node, as a guess for the next, shape (o,).
+        nearby: block of each shape that was near each node, as a guess; written, shape (n + 1, o).
         rows: written; with room for a row of each node and each obstacle, and of each node and the wall.
 
     Returns:
@@ -246,8 +247,8 @@ def solid_rows(
                     boxes[s - discs, 0] - reach <= x <= boxes[s - discs, 2] + reach
                     and boxes[s - discs, 1] - reach <= y <= boxes[s - discs, 3] + reach
                 ):
-                    nearest = nearest_edge(x, y, s - discs, nearby[o], around)
-                    distance, nx, ny, nearby[o] = nearest.signed, nearest.x, nearest.y, nearest.block
+                    nearest = nearest_edge(x, y, s - discs, nearby[i, o], around)
+                    distance, nx, ny, nearby[i, o] = nearest.signed, nearest.x, nearest.y, nearest.block
                 else:
                     continue
                 if not (distance <= reach):
@@ -371,9 +372,6 @@ class Stiffness(RowBarrier):
         )
 
 
-REACH = 0.5  # segments; what is farther from touching than this has no row
-
-
 @compiled
 def _crosses(points: Points, i: int, j: int) -> bool:
     """Return whether the segments from nodes i and j on cross; one that does not exist crosses nothing."""
@@ -450,8 +448,9 @@ def find_self_contacts(
     count, passed, last, farthest = 0, 0, len(after) - 1, 0.0
     for i in range(last + 1):
         farthest = max(farthest, math.hypot(after[i, 0] - before[i, 0], after[i, 1] - before[i, 1]))
-    # Places of a thread that can touch have half a turn of it on itself between them.
-    reach, apart = diameter + REACH * segment, 0.5 * math.pi * diameter / segment
+    # What is farther from touching than half a segment has no row. Places of a thread that can touch have half a turn
+    # of it on itself between them.
+    reach, apart = diameter + 0.5 * segment, 0.5 * math.pi * diameter / segment
     for k in range(last + 1):
         j = -1
         while j < last - 1:

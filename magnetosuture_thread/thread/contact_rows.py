@@ -26,12 +26,10 @@ from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inn
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
-    BEFORE,
     CONTACT,
     GRIPS,
     NO_SHAPE,
     SPAN,
-    START,
     GripBuffers,
     RodBuffers,
     StepBuffers,
@@ -39,7 +37,6 @@ from magnetosuture_thread.thread.program import (
 )
 
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
-FRICTION_COMPLIANCE = 1e-7  # as of a segment: far below what can be measured, and exact at once for the solver
 
 
 @compiled_uncounted
@@ -164,7 +161,7 @@ def stays_clear(
                 clearance[i] = min(clearance[i], to.distance[c])
             if found < 0 or not clearance[i] >= minimum:
                 return False
-    found = find_chord_contacts(points, workspace, unit, radius, clearance, np.int64(0), to)
+    found = find_chord_contacts(points, workspace, unit, radius, clearance, 0, to)
     for c in range(found):
         if to.distance[c] < minimum and not (known[to.node[c]] and known[to.node[c] + 1]):
             return False
@@ -218,7 +215,7 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
         solve, over the greatest of them.
     """
     buffers, grips, known, contacts = rod.program, rod.grips, rod.program.known, rod.program.contacts
-    best, before, start = grips.contact, rod.motion[BEFORE], rod.motion[START]
+    best, before, start = grips.contact, rod.motion.before, rod.motion.start
     shapes, forces, gradient, lower, upper = grips.shape, grips.force, buffers.gradient, buffers.lower, buffers.upper
     node, obstacle, place, normal = contacts.node, contacts.obstacle, contacts.place, contacts.normal
     first, compliance, limits, multipliers = buffers.first, buffers.compliance, buffers.limit, buffers.multipliers
@@ -259,8 +256,9 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
                     else:
                         gradient[here, k - begin, 0], gradient[here, k - begin, 1] = x, y
                 first[here] = begin
-                lower[here] = upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
-                compliance[here], limits[here] = FRICTION_COMPLIANCE, limit
+                # As of a segment: far below what can be measured, and exact at once for the solver.
+                compliance[here], limits[here] = 1e-7, limit
+                lower[here] = upper[here] = compliance[here] * grip[2] - moved / interval
                 multipliers[here] = max(min(grip[2], limit), -limit)
                 node[at], obstacle[at], place[at] = i, shape, place[c]
                 written += 1

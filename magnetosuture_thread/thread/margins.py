@@ -136,9 +136,9 @@ class BarrierMargins:
         return int(self.clearance.argmin())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Margins(Mapping[str, BarrierMargins]):
-    """The margins of all barriers at one instant, by the barriers' names.
+    """The margins of all barriers at one instant, by the barriers' names. Not to be written to.
 
     Attributes:
         barriers: one entry for each barrier, in the order of the formulation, then the user's.
@@ -193,11 +193,11 @@ class Margins(Mapping[str, BarrierMargins]):
                 close [m].
             scene_version: of the scene.
         """
-        nodes = set[int]()
+        nodes: set[int] = set()
         for margins in barriers:
-            if len(margins.value) and margins.barrier in SOLID:
+            if margins.barrier in SOLID and len(margins.value):
                 nodes.update(margins.node[margins.clearance <= contact_tolerance].tolist())
-        return cls(tuple(barriers), tuple(sorted(nodes)), scene_version=scene_version)
+        return cls(tuple(barriers), tuple(sorted(nodes)), UNKNOWN, scene_version)
 
 
 def _row(margins: BarrierMargins, row: int) -> BarrierMargins:

@@ -21,7 +21,6 @@ SEGMENTS = bounded("", 3, 2000)
 DIAMETER = bounded("m", 1e-6, 0.01)
 VISCOSITY = bounded("Pa s", 1e-6, 1e4)
 DRAG = bounded("Pa s", 0.0, 1e6)
-SHARE = bounded("", 1e-3, 1.0)
 MIN_ELASTIC_MODULUS = 1e5  # Pa; a tenth of the softest materials': filaments of a braid slide when it is bent
 MAX_ELASTIC_MODULUS = 1e12  # Pa; of diamond, stiffer than any wire
 MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
@@ -61,8 +60,8 @@ class Medium:
         viscosity: Annotated[float, VISCOSITY],
         length: Annotated[float, LENGTH],
         diameter: Annotated[float, DIAMETER],
-        wetted_fraction: Annotated[float, SHARE] = 0.5,
-        drag_anisotropy: Annotated[float, SHARE] = 0.5,
+        wetted_fraction: Annotated[float, bounded("", 1e-3, 1.0)] = 0.5,
+        drag_anisotropy: Annotated[float, bounded("", 1e-3, 1.0)] = 0.5,
     ) -> Medium:
         """Return the drag of a slender thread that floats in a viscous liquid, without inertia.
 

@@ -22,14 +22,11 @@ from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, co
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.margins import FrictionState
 from magnetosuture_thread.thread.program import (
-    BEFORE,
     CONTACT,
     END,
     END_VELOCITIES,
     INTERNAL,
     SPAN,
-    START,
-    VELOCITIES,
     RodBuffers,
     Table,
     Vector,
@@ -38,7 +35,6 @@ from magnetosuture_thread.thread.program import (
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
 CURVATURE_CORRECTION = 1.0 / 6.0  # of the energy, by the slope of the curvature
 CLAMP_CORRECTION = 1.5  # the same in the first segment of a clamped thread
-SHARPEST = 1.0  # rad^2; a sharper turn at a node is a kink between straight segments, and no arc
 
 
 class RodProperties(NamedTuple):
@@ -311,14 +307,13 @@ def tension_stiffness(
 def _resolved(square: float) -> tuple[float, float]:
     """Return the part of a squared turn that a chord is corrected for, and its slope.
 
-        f(c^2) = c^2 (1 - (c^2 / c_max^2)^2)
+        f(c^2) = c^2 (1 - c^4)
 
-    A sharper turn is a kink that these segments do not resolve; it does not shorten the chords beside it.
+    A turn of more than 1 rad is a kink that these segments do not resolve; it does not shorten the chords beside it.
     """
-    share = square / SHARPEST
-    if share >= 1.0:
+    if square >= 1.0:
         return 0.0, 0.0
-    return square * (1.0 - share * share), max(0.0, 1.0 - 3.0 * share * share)
+    return square * (1.0 - square * square), max(0.0, 1.0 - 3.0 * square * square)
 
 
 @compiled_inline
@@ -401,7 +396,7 @@ def keep_internal_forces(buffers: RodBuffers, rows: int, interval: float) -> Non
         rows: of the program.
         interval: dt [s].
     """
-    program, motion, velocities = buffers.program, buffers.motion, buffers.motion[VELOCITIES]
+    program, motion, velocities = buffers.program, buffers.motion, buffers.motion.velocities
     nodes, dimension = velocities.shape
     internal, contact, load = buffers.end[INTERNAL], buffers.end[CONTACT], buffers.tail_load
     multipliers = program.multipliers
@@ -424,7 +419,7 @@ def keep_internal_forces(buffers: RodBuffers, rows: int, interval: float) -> Non
     for a in range(dimension):
         load[a] = contact[0, a] - drag_linear[0, a]
         for b in range(dimension):
-            load[a] -= drag[0, a, b] * (motion[START, 0, b] - motion[BEFORE, 0, b]) / interval
+            load[a] -= drag[0, a, b] * (motion.start[0, b] - motion.before[0, b]) / interval
     # A row of a contact has no gradient at a node that is known, whose share is with the needle.
     for row in range(nodes - 1, rows):
         c = row - nodes + 1

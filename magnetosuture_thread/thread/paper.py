@@ -23,13 +23,15 @@ in a node's way along it, is moved in to it along its normal; the dish is convex
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from magnetosuture_thread.geometry.barrier import Barrier
 from magnetosuture_thread.geometry.obstacles import WALL, Workspace
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.thread.barriers import (
     Connectivity,
     EnhancedConnectivity,
@@ -43,10 +45,13 @@ from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.program import SPAN, Solver, Table, first_rows
 from magnetosuture_thread.thread.step import AddedRows, Formulation, PrescribedMotion, StepResult, ThreadState
 
+WEIGHT = bounded("", 1e-30, 1e12)
 MAX_ELONGATION = 1.5  # of the thread; slacks that give way by more hold nothing together, whatever the residuals say
 
 
-class PaperOptions(NamedTuple):
+@checked_arguments("paper")
+@dataclass(frozen=True)
+class PaperOptions:
     """The parameters of the printed program.
 
     Attributes:
@@ -58,11 +63,11 @@ class PaperOptions(NamedTuple):
         lead_ahead: whether the needle moves before the rows are set up.
     """
 
-    damping: float = 0.95
-    gain: float = 20.0
-    stiffness_gain: float = 20.0
-    connectivity_weight: float = 1e5
-    stiffness_weight: float = 1.0
+    damping: Annotated[float, bounded("", 0.0, 1.0)] = 0.95
+    gain: Annotated[float, bounded("1/s", 1e-6, unlimited=True)] = 20.0
+    stiffness_gain: Annotated[float, bounded("1/s", 1e-6, unlimited=True)] = 20.0
+    connectivity_weight: Annotated[float, WEIGHT] = 1e5
+    stiffness_weight: Annotated[float, WEIGHT] = 1.0
     lead_ahead: bool = False
 
     @classmethod
@@ -99,9 +104,7 @@ class PaperFormulation(Formulation):
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
         unit, options, buffers = self._thread.segment_length, self._options, self._program
-        options = options._replace(
-            gain=min(options.gain, 1.0 / interval), stiffness_gain=min(options.stiffness_gain, 1.0 / interval)
-        )
+        alpha, gamma = min(options.gain, 1.0 / interval), min(options.stiffness_gain, 1.0 / interval)
         before, velocities = np.ascontiguousarray(state.positions / unit), state.velocities / unit
         moved, known, nodes = before.copy(), buffers.known, list(drive.nodes)
         known[:] = False
@@ -112,8 +115,8 @@ class PaperFormulation(Formulation):
             self.forget()
         buffers.blocks[:], buffers.couplings[:] = np.eye(self.dimension), 0.0  # P = I, q = -kappa v
         buffers.linear[:] = -options.damping * velocities
-        self._write_barriers(start, options)
-        contacts, before_depth = self._write_obstacles(start, options.gain)
+        self._write_barriers(start, alpha, gamma)
+        contacts, before_depth = self._write_obstacles(start, alpha)
         added: AddedRows | None = None
         if self.added:
             self.added.begin(state.positions, drive, interval)
@@ -128,7 +131,7 @@ class PaperFormulation(Formulation):
         # The hard barriers, h(x + dt u) >= (1 - alpha dt) h(x), where the obstacles themselves are.
         near = self.workspace.near(after.positions)
         depth = max(0.0, self._radius - float(near.distance[~known[near.node]].min(initial=self._radius)))
-        allowed = (1.0 - options.gain * interval) * before_depth + DEPTH_TOLERANCE
+        allowed = (1.0 - alpha * interval) * before_depth + DEPTH_TOLERANCE
         longest = float(np.sqrt(np.square(np.diff(end, axis=0)).sum(axis=1)).mean())
         status, converged = solution.status, depth <= allowed and longest <= MAX_ELONGATION
         if longest > MAX_ELONGATION:
@@ -137,14 +140,14 @@ class PaperFormulation(Formulation):
             status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
         return StepResult(after, solution.solver, status, solution.residuals, 1, converged)
 
-    def _write_barriers(self, start: Points, options: PaperOptions) -> None:
+    def _write_barriers(self, start: Points, alpha: float, gamma: float) -> None:
         """Write the rows of connectivity, enhanced connectivity and stiffness, with their slacks as compliances."""
-        connectivity, stiffness = 1.0 / options.connectivity_weight, 1.0 / options.stiffness_weight
+        connectivity, stiffness = 1.0 / self._options.connectivity_weight, 1.0 / self._options.stiffness_weight
         row, buffers = 0, self._program
         for barrier, gain, compliance in (
-            (Connectivity(1.0), options.gain, connectivity),
-            (EnhancedConnectivity(1.0), options.gain, connectivity),
-            (Stiffness(self._rest), options.stiffness_gain, stiffness),
+            (Connectivity(1.0), alpha, connectivity),
+            (EnhancedConnectivity(1.0), alpha, connectivity),
+            (Stiffness(self._rest), gamma, stiffness),
         ):
             rows = barrier.rows(start)
             part = slice(row, row + len(rows.value))

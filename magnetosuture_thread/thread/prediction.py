@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.geometry.needle_arc import MAX_NORM_ERROR
 from magnetosuture_thread.geometry.polyline import Points, as_numbers
-from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.configuration import Quantity, plain
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.mechanics import ThreadForces
@@ -41,7 +42,7 @@ class NeedlePose:
     Attributes:
         stamp: [s]
         tail: the blunt end, where the thread is attached, shape (d,) [m].
-        heading: unit vector from tail to tip, shape (d,).
+        heading: unit vector from tail to tip, shape (d,); made so where it is one to `MAX_NORM_ERROR`.
         deviation: standard deviations of the tail in each direction [m] and of the heading [rad]; zeros if not known.
         motion: of the needle, for the forces; None if only the poses tell.
     """
@@ -54,16 +55,18 @@ class NeedlePose:
 
     def __post_init__(self) -> None:
         """Take sequences of numbers as arrays, and numbers of other types as floats."""
-        stamp: Any = self.stamp
-        if isinstance(stamp, np.number):
-            object.__setattr__(self, "stamp", float(stamp))
-        for name in ("tail", "heading"):
-            object.__setattr__(self, name, as_numbers(f"needle pose {name}", getattr(self, name)))
+        object.__setattr__(self, "stamp", plain(self.stamp))
+        object.__setattr__(self, "tail", as_numbers("needle pose tail", self.tail))
+        heading = as_numbers("needle pose heading", self.heading)
+        error = abs(math.hypot(*heading.ravel().tolist()) - 1.0)
+        if 1e-9 < error <= MAX_NORM_ERROR:  # not that of rounding: a heading that is given on stays as it is
+            heading = heading / np.linalg.norm(heading)
+        object.__setattr__(self, "heading", heading)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Prediction:
-    """The thread at one instant.
+    """The thread at one instant. Not to be written to.
 
     Attributes:
         stamp: [s]
@@ -93,8 +96,8 @@ class Prediction:
     status: str
     residual: float
     converged: bool
-    compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
-    compute_forces: Callable[[], ThreadForces | None] = field(default=lambda: None, repr=False, compare=False)
+    compute_margins: Callable[[], Margins] = field(repr=False)
+    compute_forces: Callable[[], ThreadForces | None] = field(default=lambda: None, repr=False)
 
     @cached_property
     def margins(self) -> Margins:
@@ -147,5 +150,5 @@ def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int =
         first = second = math.nan
     if not (0.0 <= first < math.inf and 0.0 <= second < math.inf):
         raise InvalidInputError("needle pose deviation", pose.deviation, "two finite numbers, not negative")
-    if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
-        raise InvalidInputError("needle pose heading", heading, "a unit vector")
+    if not abs((size := math.hypot(*heading)) - 1.0) <= MAX_NORM_ERROR:
+        raise InvalidInputError("needle pose heading", f"{heading}, norm {size:g}", "a unit vector")

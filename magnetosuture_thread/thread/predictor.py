@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -28,10 +29,8 @@ from magnetosuture_thread.thread.solvers import make_solver
 from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState, WarmStart
 
 LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
-START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
 MOTION_TIME = 4e-3  # s; shorter, what the pose's noise bends counts for more, and longer, the thread has gone on
-MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
 
 FORMULATIONS = (RodFormulation.name, PaperFormulation.name)
@@ -136,6 +135,8 @@ class ThreadPredictor:
         self.added = formulation.added
         self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
         self._nodes = np.array([0, *self.fixed_nodes], np.int64)
+        # Of their positions; with a slice, for the needle's tail alone, numpy takes a tenth of the time.
+        self._selected: Indices | slice = self._nodes if fixed_nodes else slice(0, 1)
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
         # A long needle reaches over the wall by up to 2 cm, and a camera sees what is above it.
         self.reach = min(workspace.wall_radius + 0.02, MAX_COORDINATE)
@@ -143,6 +144,10 @@ class ThreadPredictor:
         self._limits = bounded("m", -far, far)
         self.pose: NeedlePose | None = None
         self.state: ThreadState | None = None
+
+    def __copy__(self) -> ThreadPredictor:
+        """Return one with buffers of its own: in shared ones the steps of one would be the other's first guess."""
+        return deepcopy(self)
 
     @classmethod
     def create(
@@ -210,7 +215,7 @@ class ThreadPredictor:
             centreline: polyline, shape (m, d), m >= 2 [m]. None is a thread that lies straight behind the needle, and
                 where the wall is in its way, along the wall.
             strict: whether a centreline of another length than the thread's, by more than `LENGTH_TOLERANCE`, is
-                refused, and a thread that lies in the wall or a shape of the scene by more than `START_DEPTH`. If not,
+                refused, and a thread that lies in the wall or a shape of the scene by more than 0.1 mm. If not,
                 a shorter centreline goes on straight, as where the camera measured a part, what is too long is left
                 out, and the thread is pushed out of what it lies in.
 
@@ -235,7 +240,8 @@ class ThreadPredictor:
             expected = f"{length:g} m, the thread's length, within {LENGTH_TOLERANCE:.0%}; strict=False takes a part"
             raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:g} m long", expected)
         chain = chain_inside(path, self.thread.segments, unit, self._room_radius)
-        if strict and isinstance(self._scene, Scene) and (name := find_collision(self._scene, chain, START_DEPTH)):
+        depth = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
+        if strict and isinstance(self._scene, Scene) and (name := find_collision(self._scene, chain, depth)):
             raise InvalidInputError("centreline", f"a thread that lies in {name}", "one clear of wall and shapes")
         return self.start_at(pose, chain)
 
@@ -305,7 +311,7 @@ class ThreadPredictor:
             heading = heading / size if size > 1e-6 else pose.heading
             return PrescribedMotion(nodes, ends, heading, last.stamp + part * interval)
 
-        results = list[StepResult]()
+        results: list[StepResult] = []
         for index in range(1, substeps + 1):
             results += self._follow(state, drive, index / substeps, interval / substeps, interval)
             state = results[-1].state
@@ -317,7 +323,7 @@ class ThreadPredictor:
         self, pose: NeedlePose, state: ThreadState, prescribed: Mapping[int, Points] | None
     ) -> tuple[Indices, Points, Points]:
         """Return the nodes of prescribed motion, the needle's first, where they are, and where at the next pose."""
-        nodes, begin = self._nodes, state.positions[self._nodes]
+        nodes, begin = self._nodes, state.positions[self._selected]
         end: Points = begin.copy()
         end[0] = pose.tail
         if prescribed:
@@ -352,7 +358,7 @@ class ThreadPredictor:
                 raise
         if done is not None and not done.passed and (done.converged or not crowded):
             return [done]
-        if done is not None and done.passed and halvings == MAX_HALVINGS:
+        if done is not None and done.passed and halvings == 5:
             self.formulation.forget()
             raise SolverError(done.solver, "the thread would pass through itself", math.inf, 0.0)
         try:
@@ -382,8 +388,11 @@ class ThreadPredictor:
         state, formulation, tolerance = self.state, self.formulation, self.contact_tolerance
         assert state is not None
         last = results[-1] if results else None
-        # The first that was not solved at once, if there is one, else the last.
-        result = next((done for done in results if done.status != SOLVED), last) if len(results) > 1 else last
+        solver, status, residual, converged = "none", STARTED, 0.0, True
+        for done in results:
+            if status in (STARTED, SOLVED):  # else it is that of the first that was not solved at once
+                solver, status = done.solver, done.status
+            residual, converged = max(residual, done.residuals.largest), converged and done.converged
         positions, links = state.positions, last.links if last else None
         warm_start = formulation.warm_start() if results and velocities is not None else None
         # At once, as barriers may move on before they are asked again.
@@ -407,10 +416,10 @@ class ThreadPredictor:
             strain=formulation.strain(positions, pose.heading, links),
             interval=interval,
             substeps=len(results),
-            solver=result.solver if result else "none",
-            status=result.status if result else STARTED,
-            residual=max([done.residuals.largest for done in results], default=0.0),
-            converged=all([done.converged for done in results]),
+            solver=solver,
+            status=status,
+            residual=residual,
+            converged=converged,
             compute_margins=compute_margins,
             compute_forces=compute_forces,
         )

@@ -33,9 +33,6 @@ SPAN = 3  # nodes that a row of the band touches, and how far apart nodes may be
 CONTACTS_PER_NODE = 64  # for which there is room; a smooth outline has dozens of corners beside one segment
 GRIPS = 3  # shapes at most that a node or a chord has friction with at once
 NO_SHAPE = -2  # in place of a shape
-BEFORE, START, LAST, VELOCITIES, ABOUT, LAST_ABOUT = range(6)
-"""Of a step's motion: where the nodes are; the same with the prescribed nodes moved; velocities over the last step; of
-this step, better with each solve; where they lead; where the program was written about."""
 END, END_VELOCITIES, INTERNAL, CONTACT = range(4)
 """Of a step's end: where the nodes are [m] and their velocities over the step [m/s]; what the segments push each node
 with; and what contacts do, with friction."""
@@ -158,25 +155,45 @@ class GripBuffers(NamedTuple):
     contact: Indices
 
 
+class StepMotion(NamedTuple):
+    """Positions and velocities of a step, each of shape (n + 1, d).
+
+    Attributes:
+        before: where the nodes are.
+        start: the same with the prescribed nodes moved.
+        last: velocities over the last step.
+        velocities: over this step, better with each solve.
+        about: where these lead.
+        last_about: where the program was written about.
+    """
+
+    before: Points
+    start: Points
+    last: Points
+    velocities: Points
+    about: Points
+    last_about: Points
+
+
 class RodBuffers(NamedTuple):
     """Memory for the steps of a rod; lengths are in units of the segment length, and forces in those of the program.
 
     Attributes:
         program: its programs.
         grips: its friction.
-        motion: positions and velocities of the step, see `BEFORE` and what follows it, shape (6, n + 1, d).
+        motion: positions and velocities of the step.
         drag: the medium's part of `blocks`, shape (n + 1, d, d).
         drag_linear: the medium's part of `linear`, shape (n + 1, d).
         end: positions [m] and velocities [m/s] at the end of the step, and forces, see `END` and what follows it, shape
             (4, n + 1, d).
         tail_load: what medium and contacts do at the needle's tail, shape (d,).
-        links: connectivity and compression at the end of the step, see `link_margins`, shape (5, n).
+        links: connectivity, compression and strain at the end of the step, see `link_margins`, shape (6, n).
         residuals: the largest of each kind over the step's solves, see `Residuals`, shape (3,).
     """
 
     program: StepBuffers
     grips: GripBuffers
-    motion: Table
+    motion: StepMotion
     drag: Table
     drag_linear: Points
     end: Table
@@ -190,9 +207,12 @@ class RodBuffers(NamedTuple):
         nodes, dimension = program.linear.shape
         places = (2, nodes, GRIPS)
         grips = GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1))
-        shapes = (6, nodes, dimension), (nodes, dimension, dimension), (nodes, dimension)
-        of_end = (4, nodes, dimension), (dimension,), (5, nodes - 1), (3,)
-        return cls(program, grips, *map(np.zeros, (*shapes, *of_end)))
+        motion, of_drag = (
+            StepMotion(*np.zeros((6, nodes, dimension))),
+            ((nodes, dimension, dimension), (nodes, dimension)),
+        )
+        of_end = (4, nodes, dimension), (dimension,), (6, nodes - 1), (3,)
+        return cls(program, grips, motion, *map(np.zeros, (*of_drag, *of_end)))
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:

@@ -68,18 +68,12 @@ from magnetosuture_thread.thread.mechanics import (
     write_forces,
 )
 from magnetosuture_thread.thread.program import (
-    ABOUT,
-    BEFORE,
     CONTACT,
     END,
     END_VELOCITIES,
-    LAST,
-    LAST_ABOUT,
     NO_SHAPE,
     SOLVED,
     SPAN,
-    START,
-    VELOCITIES,
     Indices,
     Mask,
     Residuals,
@@ -192,8 +186,7 @@ def solve_step(
         The fields of `StepProgress`, which a named tuple would take as long to return as it takes to set up a step.
     """
     motion, friction = buffers.motion, model.workspace.friction
-    # Numbers of a type of their own: a function is compiled again for each number that is written out.
-    contacts, status = np.int64(-1), np.int64(banded.SOLVED)
+    contacts, status = -1, banded.SOLVED
     if solves == 0:
         _begin(buffers, step_input, model.rod.unit)
     last_off = np.inf
@@ -202,14 +195,14 @@ def solve_step(
             _accept(buffers, friction, rows, step_input.interval)
         contacts, off, rubs = _linearise(model, buffers, step_input, solves, elsewhere, contacts, last_off)
         last_off = off
-        _copy(motion[ABOUT], motion[LAST_ABOUT])
+        _copy(motion.about, motion.last_about)
         if contacts < 0:
             return NO_ROOM, contacts, solves, off, status
         if solves == model.max_solves or (off <= 1.0 and not rubs):
             _finish(model, buffers, step_input, off)
             return ENDED, contacts, solves, off, status
         _write_objective(model.rod, buffers, step_input)
-        rows = len(motion[ABOUT]) - 1 + contacts
+        rows = len(motion.about) - 1 + contacts
         word = _solve(buffers, solver_buffers, rows, model.tolerance) if model.structured else banded.STALLED
         if word != banded.SOLVED and word != banded.RESTARTED:
             return UNSOLVED, contacts, solves, off, status
@@ -237,20 +230,20 @@ def _begin(buffers: RodBuffers, step_input: StepInput, unit: float) -> None:
     buffers.residuals[:] = 0.0
     for i in range(nodes):
         for a in range(dimension):
-            motion[BEFORE, i, a] = motion[START, i, a] = step_input.positions[i, a] / unit
-            motion[LAST, i, a] = motion[VELOCITIES, i, a] = step_input.velocities[i, a] / unit
+            motion.before[i, a] = motion.start[i, a] = step_input.positions[i, a] / unit
+            motion.last[i, a] = motion.velocities[i, a] = step_input.velocities[i, a] / unit
     for k in range(len(step_input.nodes)):
         known[step_input.nodes[k]] = True
         for a in range(dimension):
-            motion[START, step_input.nodes[k], a] = step_input.ends[k, a] / unit
+            motion.start[step_input.nodes[k], a] = step_input.ends[k, a] / unit
     goes_on = step_input.last_interval > 0.0 and interval <= MAX_STEP_RATIO * step_input.last_interval
     for i in range(nodes):
         for a in range(dimension):
-            goes_on = goes_on and (known[i] or abs(interval * motion[LAST, i, a]) <= 1.0)
+            goes_on = goes_on and (known[i] or abs(interval * motion.last[i, a]) <= 1.0)
     for i in range(nodes):
         for a in range(dimension):
-            way = interval * motion[LAST, i, a] if goes_on and not known[i] else 0.0
-            motion[ABOUT, i, a] = motion[START, i, a] + way
+            way = interval * motion.last[i, a] if goes_on and not known[i] else 0.0
+            motion.about[i, a] = motion.start[i, a] + way
 
 
 @compiled_within
@@ -276,10 +269,10 @@ def _linearise(
         the last solve leads: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or
         less if it is exact; and whether the limits of friction are still to be found.
     """
-    about, last_about, off, rubs = buffers.motion[ABOUT], buffers.motion[LAST_ABOUT], np.inf, False
+    about, last_about, off, rubs = buffers.motion.about, buffers.motion.last_about, np.inf, False
     contacts = last_contacts
     for attempt in range(2):
-        count = solves if attempt == 0 else np.int64(0)
+        count = solves if attempt == 0 else 0
         contacts, now_off, now_rubs = _write_rows(model, buffers, step_input, count, elsewhere, contacts)
         if attempt == 1:
             break
@@ -289,7 +282,7 @@ def _linearise(
         for i in range(len(about)):
             for a in range(about.shape[1]):
                 about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
-        contacts = np.int64(-1)
+        contacts = -1
     return contacts, off, rubs
 
 
@@ -303,13 +296,13 @@ def _write_rows(
         See `_linearise`.
     """
     program, motion, interval = buffers.program, buffers.motion, step_input.interval
-    about, start = motion[ABOUT], motion[START]
+    about, start = motion.about, motion.start
     rod, workspace, segments = model.rod, model.workspace, len(about) - 1
     mechanics.chord_lengths(about, step_input.heading, rod.clamped, program.chords)
     strain = segment_rows(program, about, start, interval)
     rough, off = knows_friction(workspace.friction), max(strain / STRAIN_TOLERANCE, elsewhere)
     cheap = solves > 0 and last_contacts >= 0 and not rough and off <= 1.0
-    if cheap and stays_clear(program, workspace, motion[LAST_ABOUT], about, rod.unit, rod.radius):
+    if cheap and stays_clear(program, workspace, motion.last_about, about, rod.unit, rod.radius):
         return last_contacts, off, False
     contacts, depth = contact_rows(program, segments, workspace, about, start, interval, rod.unit, rod.radius, True)
     rubs = False
@@ -368,7 +361,7 @@ def _write_objective(rod: RodProperties, buffers: RodBuffers, step_input: StepIn
     moved already. In air a = 1, and of Z v only the inertia's part is left; the flow acts on the drag's part alone.
     """
     program, motion, heading, interval = buffers.program, buffers.motion, step_input.heading, step_input.interval
-    before, start, last, about = motion[BEFORE], motion[START], motion[LAST], motion[ABOUT]
+    before, start, last, about = motion.before, motion.start, motion.last, motion.about
     nodes, dimension = start.shape
     blocks, couplings, linear = program.blocks, program.couplings, program.linear
     drag, drag_linear, weights, bands = buffers.drag, buffers.drag_linear, rod.weights, rod.bands
@@ -445,7 +438,7 @@ def _solve(buffers: RodBuffers, solver_buffers: banded.SolverBuffers, rows: int,
     Returns:
         See `banded.STATUS`; `STALLED` if neither passes.
     """
-    program, u = program_view(buffers.program, rows), buffers.motion[VELOCITIES]
+    program, u = program_view(buffers.program, rows), buffers.motion.velocities
     multipliers, worst = buffers.program.multipliers[:rows], buffers.residuals
     for attempt in range(2):
         word, _ = banded.solve(program, u, multipliers, solver_buffers)
@@ -462,7 +455,7 @@ def _solve(buffers: RodBuffers, solver_buffers: banded.SolverBuffers, rows: int,
 @compiled_inner
 def _accept(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -> None:
     """Accept the velocities and multipliers in the buffers as the solution of the first rows: keep what follows."""
-    start, velocities, about = buffers.motion[START], buffers.motion[VELOCITIES], buffers.motion[ABOUT]
+    start, velocities, about = buffers.motion.start, buffers.motion.velocities, buffers.motion.about
     segments = len(about) - 1
     keep_pushes(buffers, rows, segments)
     if knows_friction(friction):
@@ -477,7 +470,7 @@ def _accept(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -
 @compiled_within
 def _finish(model: StepModel, buffers: RodBuffers, step_input: StepInput, off: float) -> None:
     """Write where the step ends, and the velocities over it; whatever else holds, nothing passes the wall."""
-    about, before, unit, end = buffers.motion[ABOUT], buffers.motion[BEFORE], model.rod.unit, buffers.end
+    about, before, unit, end = buffers.motion.about, buffers.motion.before, model.rod.unit, buffers.end
     if off > 1.0:
         move_inside(about, buffers.program.known, (model.workspace.wall_radius - model.rod.radius) / unit)
     for i in range(len(about)):
@@ -522,8 +515,10 @@ class RodFormulation(Formulation):
         self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._program.first))
         self._solve_step, self._force_kernel = TypedKernel(solve_step), TypedKernel(write_forces)
         self._link_kernel = TypedKernel(link_margins)
-        self._last_nodes = np.arange(1, self._rows + 1, dtype=np.uint32)
-        self._last_nodes.flags.writeable = False
+        last_nodes = np.arange(1, self._rows + 1, dtype=np.uint32)
+        last_nodes.flags.writeable = False
+        no_obstacle, no_bound = constant_column(NO_OBSTACLE, self._rows, "i4"), constant_column(-math.inf, self._rows)
+        self._link_columns = last_nodes, no_obstacle, no_bound, constant_column(0.0, 0)
         self._self_contact = next((barrier for barrier in barriers if isinstance(barrier, SelfContact)), None)
         self.touches_itself = self._self_contact is not None
         self._only_self_contact = all(isinstance(barrier, SelfContact) for barrier in barriers)
@@ -578,7 +573,7 @@ class RodFormulation(Formulation):
         progress = self._complete(step_input, self.solve(step_input), outcomes)
         if before is not None:
             try:
-                added = self._linearised(self.buffers.motion[ABOUT], interval)
+                added = self._linearised(self.buffers.motion.about, interval)
             except InvalidInputError:  # of a user's barrier: the step is not taken
                 self.restore(before)
                 raise
@@ -611,14 +606,14 @@ class RodFormulation(Formulation):
         force: Points | None = None
         while progress.code == UNSOLVED:
             rows, off = self._rows + progress.contacts, 0.0
-            solution = self._solve(first_rows(self._program, rows), motion[VELOCITIES], added)
+            solution = self._solve(first_rows(self._program, rows), motion.velocities, added)
             outcomes.append((solution.status, solution.solver))
             self._program.multipliers[:rows], pushes = np.split(solution.multipliers, [rows])
-            motion[VELOCITIES] = solution.velocities
+            motion.velocities[:] = solution.velocities
             np.maximum(buffers.residuals, solution.residuals, out=buffers.residuals)
             if added is not None:
-                force = added.force(pushes, motion[VELOCITIES].shape) if self._only_self_contact else None
-                added = self._linearised(motion[START] + interval * motion[VELOCITIES], interval)
+                force = added.force(pushes, motion.velocities.shape) if self._only_self_contact else None
+                added = self._linearised(motion.start + interval * motion.velocities, interval)
                 off = added.off
             progress = self.solve(step_input, progress.solves + 1, off, rows, model)
             outcomes.append((banded.STATUS[progress.status], self._solver.name))
@@ -630,14 +625,16 @@ class RodFormulation(Formulation):
         return progress
 
     def _linearised(self, about: Points, interval: float) -> AddedRows:
-        return self.added.linearised(about, self.buffers.motion[START], self._program.known, interval)
+        return self.added.linearised(about, self.buffers.motion.start, self._program.known, interval)
 
     def _result(self, step_input: StepInput, progress: StepProgress, outcomes: Sequence[tuple[str, str]]) -> StepResult:
         """Return what the buffers have of a step that has ended."""
         buffers, off, solves, barrier = self.buffers, progress.off, progress.solves, self._self_contact
-        end, residuals = buffers.end.copy(), Residuals(*buffers.residuals.tolist())
+        end, residuals = buffers.end.copy(), Residuals._make(buffers.residuals.tolist())
         state = ThreadState(end[END], end[END_VELOCITIES], step_input.interval)
-        status, solver = next((outcome for outcome in outcomes if outcome[0] != SOLVED), outcomes[-1])
+        status, solver = outcomes[0]
+        for outcome in outcomes[1:]:
+            status, solver = outcome if status == SOLVED else (status, solver)
         grip, passed = buffers.grips.force.copy() if self._rough else None, False
         if off > 1.0:
             status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
@@ -656,7 +653,7 @@ class RodFormulation(Formulation):
         """Let compiled code take a step as far as it gets; see `solve_step`. Arrays have to be contiguous."""
         model = self.step_model if model is None else model
         arguments = model, self.buffers, self._solver_buffers, step_input, solves, elsewhere, rows
-        return StepProgress(*self._solve_step(*arguments))
+        return StepProgress._make(self._solve_step(*arguments))
 
     def separate(self) -> RodFormulation:
         """Return the same formulation with buffers of its own, for the steps of another thread like this one."""
@@ -692,19 +689,19 @@ class RodFormulation(Formulation):
     def strain(self, positions: Points, heading: Points, links: Table | None = None) -> Vector:
         """Return each segment's length over the chord of its arc, less one; see `Formulation`."""
         rows = self._link_margins(positions, heading) if links is None else links
-        return np.asarray(rows[3] / rows[4])
+        return np.asarray(rows[5])
 
     def _link_margins(self, positions: Points, heading: Points) -> Table:
-        """Return value and clearance of connectivity and of compression, and the chords; see `link_margins`."""
-        points, rows = np.ascontiguousarray(positions), np.empty((5, self._rows))
+        """Return connectivity, compression, chords and strain; see `link_margins`."""
+        points, rows = np.ascontiguousarray(positions), np.empty_like(self.buffers.links)
         self._link_kernel(self.rod, points, np.ascontiguousarray(heading), np.empty(points.shape), rows)
         return rows
 
     def segment_margins(self, positions: Points, heading: Points, links: Table | None = None) -> list[BarrierMargins]:
         """Return connectivity and compression; see `Formulation`."""
         rows = self._link_margins(positions, heading) if links is None else links
-        column = constant_column(NO_OBSTACLE, self._rows, "i4")
+        nodes, obstacle, no_bound, no_normal = self._link_columns
         return [
-            BarrierMargins(CONNECTIVITY, self._last_nodes, column, rows[0], rows[1]),
-            BarrierMargins(COMPRESSION, self._last_nodes, column, rows[2], rows[3]),
+            BarrierMargins(CONNECTIVITY, nodes, obstacle, rows[0], rows[1], no_bound, no_normal),
+            BarrierMargins(COMPRESSION, nodes, obstacle, rows[2], rows[3], no_bound, no_normal),
         ]

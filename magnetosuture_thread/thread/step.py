@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.barriers import SolidRows, solid_rows
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE
-from magnetosuture_thread.thread.margins import BarrierMargins
+from magnetosuture_thread.thread.margins import BarrierMargins, constant_column
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.program import (
@@ -36,8 +35,7 @@ from magnetosuture_thread.thread.program import (
 )
 
 
-@dataclass(frozen=True)
-class ThreadState:
+class ThreadState(NamedTuple):
     """The thread at one instant.
 
     Attributes:
@@ -73,8 +71,7 @@ class ThreadState:
         return ThreadState(positions, velocities, self.interval)
 
 
-@dataclass(frozen=True)
-class PrescribedMotion:
+class PrescribedMotion(NamedTuple):
     """The nodes whose motion is known: the lead, what tissue holds, what another instrument grasps.
 
     Attributes:
@@ -95,8 +92,7 @@ class PrescribedMotion:
         return np.asarray(self.nodes, np.int64), ends, np.ascontiguousarray(self.heading, dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class StepResult:
+class StepResult(NamedTuple):
     """One step's end point and how it was found.
 
     Attributes:
@@ -119,9 +115,9 @@ class StepResult:
     residuals: Residuals
     solves: int
     converged: bool
-    loads: tuple[Table, Vector] | None = field(default=None, compare=False)
-    grip: Table | None = field(default=None, compare=False)
-    links: Table | None = field(default=None, compare=False)
+    loads: tuple[Table, Vector] | None = None
+    grip: Table | None = None
+    links: Table | None = None
     passed: bool = False
 
 
@@ -305,7 +301,7 @@ class Formulation(ABC):
         self.workspace = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)
         # Memory of margins.
-        self._nearby = np.full(len(workspace.shapes), -1)
+        self._nearby = np.full((nodes, len(workspace.shapes)), -1)
         self._solid_rows = SolidRows.room((len(workspace.shapes) + 1) * nodes, self.dimension)
         self._write_solid_rows = TypedKernel(solid_rows)
         nothing = SolidRows.room(0, self.dimension)
@@ -389,14 +385,15 @@ class Formulation(ABC):
         points, rows = np.ascontiguousarray(positions), self._solid_rows
         memory = self._margin_workspace.data, self._radius, self._nearby, rows
         count, obstacles = self._write_solid_rows(points, *memory)
-        if count == 0:
-            return self._far_from_solids
-        parts = (OBSTACLE, slice(0, obstacles)), (WALL, slice(obstacles, count))
-        columns = [(name, [column[part].copy() for column in rows]) for name, part in parts]
-        return [
-            BarrierMargins(name, node, obstacle, value, clearance, normal=normal)
-            for name, (node, obstacle, value, clearance, normal) in columns
-        ]
+        margins = []
+        for far, part in zip(self._far_from_solids, (slice(0, obstacles), slice(obstacles, count)), strict=True):
+            if part.start < part.stop:
+                node, obstacle, value, clearance, normal = [column[part].copy() for column in rows]
+                bound = constant_column(-math.inf, len(value))
+                margins.append(BarrierMargins(far.barrier, node, obstacle, value, clearance, bound, normal))
+            else:
+                margins.append(far)
+        return margins
 
     def _solve(self, program: ChainProgram, velocities: Points, added: AddedRows | None) -> Solution:
         """Return the solution of a program with the rows of added barriers, started from the buffers' multipliers."""

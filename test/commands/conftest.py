@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING
@@ -11,30 +10,6 @@ import pytest
 
 if TYPE_CHECKING:
     from test.nodes.programs import Programs
-
-
-class Interrupting:
-    """A person who presses Ctrl-C as soon as a job tells how far it is.
-
-    Attributes:
-        went_on: what the job told each time that it went on after that.
-    """
-
-    def __init__(self) -> None:
-        self.went_on: list[float] = []
-
-    def __call__(self, share: float) -> None:
-        """Press it."""
-        signal.raise_signal(signal.SIGINT)
-        self.went_on.append(share)
-
-
-@pytest.fixture
-def interrupting() -> Iterator[Interrupting]:
-    """Have Ctrl-C heeded as in a terminal: in a shell's background it is ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield Interrupting()
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,10 +1,8 @@
-"""`magnetosuture bag`: what is in a bag, and a whole one of what is intact; recording to a full disk."""
+"""`magnetosuture bag`: what is in a bag, and a whole one of what is intact."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -80,41 +78,6 @@ def test_repair_makes_a_whole_bag_of_what_is_intact(damaged: Path, tmp_path: Pat
         assert reader.message_count == sum(new.counts.values())
     assert cli.main(["bag", "repair", str(damaged), "--output", str(output)]) == 1
     assert "exists already" in capsys.readouterr().err
-
-
-# `whole_folder` as `simulate` uses it, on a disk that takes files of a megabyte.
-FULL = """
-import os, resource, signal, sys
-from pathlib import Path
-from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import whole_folder
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
-try:
-    with whole_folder(Path(sys.argv[1]), is_recording=sys.argv[2] == "recording") as folder:
-        (folder / "logs").mkdir()
-        with BagWriter(folder / "bag", name="run") as bag:
-            bag.add_topic("/noise", "std_msgs/msg/UInt8MultiArray")
-            for index in range(1000):
-                bag.write("/noise", 10**9 + index * 10**7, os.urandom(10_000))
-except BagError as error:
-    print(error)
-"""
-
-
-@pytest.mark.parametrize("kind", ["recording", "result"])
-def test_a_recording_stays_when_the_disk_is_full_and_nothing_else_does(tmp_path: Path, kind: str):
-    output = tmp_path / "run"
-    command = [sys.executable, "-c", FULL, str(output), kind]
-    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
-    assert "the disk takes no larger file after" in said
-    if kind == "result":
-        assert list(tmp_path.iterdir()) == []
-        return
-    assert str(output / "bag" / "run_0.mcap") in said
-    assert Bag(output / "bag").counts["/noise"] > 60
-    assert list(tmp_path.iterdir()) == [output]
 
 
 def test_a_topic_of_ours_in_another_serialization_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -13,6 +13,7 @@ from typing import Any
 from unittest.mock import create_autospec
 
 import cv2
+import numpy as np
 import pytest
 
 from magnetosuture_thread import replay_offline
@@ -20,7 +21,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands import reproduce
-from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate
+from magnetosuture_thread.commands.simulate import SUMMARY_FILE, host_bare_rig, simulate
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 from magnetosuture_thread.settings.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, SCENE, TIP_SETPOINT
@@ -81,6 +82,13 @@ def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     assert summary.error_truth is not None
     assert summary.error_truth["mean"] < 2.0
     assert shares[-1] == 1.0
+
+
+def test_a_rig_of_its_own_is_what_the_graph_runs_on(scenario: Path, tmp_path: Path):
+    truth = tmp_path / "truth.yaml"
+    truth.write_text("/**/rig_simulator: {ros__parameters: {coil_gains: [-1.0, -1.0, -1.0, -1.0]}}")
+    with pytest.raises(GraphError, match="needle does not follow"):
+        simulate(str(scenario), tmp_path / "bag", rate=0.5, rig=str(truth))
 
 
 def test_the_bag_holds_everything_says_that_it_is_simulated_and_is_replayed(run, scenario: Path, tmp_path: Path):
@@ -154,6 +162,19 @@ def test_under_faults_the_tracker_is_right_or_silent_and_boards_are_driven_by_th
     following = [state for state in states if not state.reasons]
     assert {state.driver for state in following} == {"roboclaw"}
     assert max(abs(current) for state in following for current in state.measured_current) > 0.5
+
+
+def test_a_bare_needle_waits_for_a_commissioning_that_nobody_begins(tmp_path: Path):
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT.replace("FAULTS", ""))
+    host_bare_rig(str(path), tmp_path / "bag", rate=0.5, duration=1.0, rig="random:1")
+    bag = Bag(tmp_path / "bag")
+    states = [record.decode() for record in bag.records({"/coils/state"})]
+    assert "no pulse" in states[-1].reasons
+    assert not any(state.armed for state in states)
+    lengths = [record.decode().poses for record in bag.records({"/ground_truth/thread"})]
+    first, last = lengths[-1][0].pose.position, lengths[-1][-1].pose.position
+    assert np.hypot(first.x - last.x, first.y - last.y) <= 1.1e-3  # a stub
 
 
 def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import datetime
 import ipaddress
 import selectors
@@ -70,6 +71,64 @@ class ServedConsole:
         while len(self._selector.get_map()) > 1:  # the loop's own pipe
             assert time.monotonic() < deadline, "a connection is left open"
             await asyncio.sleep(0.01)
+
+
+class Link:
+    """A TCP proxy before a server, in the server's loop.
+
+    Attributes:
+        mode: "pass"; "stalled", as a radio link that is away, which keeps all bytes back; or "dead": whatever is sent
+            is lost, and nobody is told.
+        port: on which it listens.
+        target: port of the server.
+    """
+
+    def __init__(self) -> None:
+        self.mode, self.port, self.target = "pass", 0, 0
+        self._pumps: list[asyncio.Task[None]] = []
+
+    async def open(self) -> None:
+        """Listen on a free port."""
+        self._server = await asyncio.start_server(self._connected, "127.0.0.1", 0)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def close(self) -> None:
+        """Cut all connections."""
+        self._server.close()
+        for pump in self._pumps:
+            pump.cancel()
+        await asyncio.gather(*self._pumps, return_exceptions=True)
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        there, back = await asyncio.open_connection("127.0.0.1", self.target)
+        for source, sink in ((reader, back), (there, writer)):
+            self._pumps.append(asyncio.create_task(self._pump(source, sink)))
+
+    async def _pump(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        try:
+            while data := await source.read(1 << 16):
+                while self.mode == "stalled":
+                    await asyncio.sleep(0.005)
+                if self.mode == "pass":
+                    sink.write(data)
+        finally:
+            sink.close()
+            with contextlib.suppress(ConnectionError):
+                await sink.wait_closed()
+
+
+@pytest.fixture
+def linked() -> Iterator[tuple[ServedConsole, Link]]:
+    """Serve the page for one test, and return the link by which a browser reaches it."""
+    console, link = ServedConsole(), Link()
+    console.run(link.open())
+    settings = ConsoleSettings(port=0, token=TOKEN, origin=f"http://127.0.0.1:{link.port}")
+    console.server = ConsoleServer(settings, console.graph, console.host)
+    console.url = console.run(console.server.start())
+    link.target = console.server._port
+    yield console, link
+    console.run(link.close())
+    console.close()
 
 
 @pytest.fixture

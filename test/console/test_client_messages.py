@@ -30,8 +30,24 @@ def test_messages_are_parsed():
     assert parsed('{"type": "end_jog"}') == ClientMessage("end_jog")
     assert parsed('{"type": "bridge_action", "action": "stop"}') == ClientMessage("bridge_action", {"action": "stop"})
     assert parsed('{"type": "tip", "position": [0.001, -0.002]}') == ClientMessage("tip", {"position": (0.001, -0.002)})
-    assert parsed(jog([1, 0])).values == {"velocity": (0.003, 0.0), "sent": 1.0}
+    assert parsed(jog([1, 0])) == ClientMessage("jog", {"velocity": (0.003, 0.0)}, 1.0)
     assert parsed(jog([0.0, -0.5])).values["velocity"] == (0.0, -0.0015)
+
+
+def test_only_what_starts_something_has_to_say_when_it_was_pressed():
+    def request(name: str, sent: object) -> ClientMessage:
+        *kind, action = name.split()
+        values = {"procedure": "", "hold_to_run": False} if kind else {}
+        return parsed(json.dumps({"type": (kind or ["bridge_action"])[0], "action": action, "sent": sent, **values}))
+
+    for name in ("stop", "disarm", "procedure pause", "procedure abort", "procedure plan"):
+        assert request(name, "yesterday").sent is None
+        assert request(name, 2.5).sent == 2.5
+    for name in ("arm", "reset", "procedure resume"):
+        assert request(name, 2.5).sent == 2.5
+        for sent in (None, "yesterday"):
+            with pytest.raises(InvalidInputError, match=r"message\.sent"):
+                request(name, sent)
 
 
 @pytest.mark.parametrize(

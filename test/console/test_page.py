@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, ViewportSize, expect
 
-from test.console.conftest import ServedConsole
+from test.console.conftest import Link, ServedConsole
 from test.console.scene import TAIL, estimated_state, forecast_state, picture, procedure_state, state
 
 pytestmark = pytest.mark.slow
@@ -254,6 +254,79 @@ def test_lost_connection_stops_the_needle_and_control_is_not_resumed(operator: O
     operator.last(EAST)
 
 
+@pytest.fixture
+def far(browser: Browser, linked: tuple[ServedConsole, Link]) -> Iterator[tuple[Operator, Link]]:
+    """Open the page over a link that may fail, and take control."""
+    served, link = linked
+    context = browser.new_context(viewport=LAPTOP)
+    operator = Operator(context.new_page(), served)
+    operator.take_control()
+    yield operator, link
+    assert operator.stats("errors") == 0
+    context.close()
+
+
+def test_a_link_that_dies_without_a_word_is_noticed_and_a_stop_over_it_is_doubted(far: tuple[Operator, Link]):
+    (operator, link), notice = far, far[0].page.locator("#notice")
+    link.mode = "dead"
+    operator.page.keyboard.press("Space")  # within a second, nothing looks wrong
+    expect(notice).to_have_text("The emergency stop may not have arrived: no answer. Use the one on the rig.")
+    expect(operator.page.locator("#link")).to_have_text("Disconnected: nothing came for 3 s")
+    assert "stop" not in operator.served.graph.actions
+    operator.page.keyboard.press("Space")
+    expect(notice).to_have_text("Not connected: the emergency stop was not sent. Use the one on the rig.")
+    link.mode = "pass"
+    expect(operator.page.locator("#link")).to_contain_text("Connected as page", timeout=1e3 * WAIT_TIMEOUT)
+    expect(operator.page.locator("#holder")).to_have_text("no page has control")
+    operator.page.keyboard.press("Space")
+    expect(operator.page.locator("#headline")).to_have_text("Emergency stop is pressed")
+
+
+def test_a_stop_that_was_doubted_and_arrives_is_doubted_no_more(far: tuple[Operator, Link]):
+    (operator, link), notice = far, far[0].page.locator("#notice")
+    link.mode = "stalled"
+    operator.page.keyboard.press("Space")
+    expect(notice).to_contain_text("may not have arrived")
+    for size in (LAPTOP, PHONE):
+        operator.page.set_viewport_size(size)
+        operator.page.evaluate("scrollTo(0, 10_000)")
+        assert operator.page.evaluate(ON_TOP, "notice")
+    link.mode = "pass"
+    expect(operator.page.locator("#headline")).to_have_text("Emergency stop is pressed", timeout=1e3 * WAIT_TIMEOUT)
+    assert "stop" in operator.served.graph.actions
+    operator.until(lambda: notice.is_hidden() or "may not" not in notice.inner_text())
+
+
+@pytest.mark.parametrize("button", ["#arm", "#run-procedure"])
+def test_what_is_pressed_while_the_link_stalls_starts_nothing_later(far: tuple[Operator, Link], button: str):
+    operator, link = far
+    graph = operator.served.graph
+    graph.shown = procedure_state("ready")
+    graph.shown["bridge"]["armed"] = button != "#arm"
+    expect(operator.page.locator(button)).to_be_enabled()
+    link.mode = "stalled"
+    operator.page.click(button)
+    operator.page.wait_for_timeout(1500)
+    link.mode = "pass"
+    operator.until(lambda: operator.page.locator("#notice").is_visible() or "disarm" in graph.actions)
+    assert "arm" not in graph.actions
+    assert graph.procedures == []
+
+
+def test_what_is_pressed_while_the_page_hangs_starts_nothing_later(operator: Operator):
+    """The browser keeps a press for a page that is busy; it tells when that was."""
+    graph, page = operator.served.graph, operator.page
+    graph.shown["bridge"]["armed"] = False
+    operator.take_control()
+    expect(page.locator("#arm")).to_be_enabled()
+    page.focus("#arm")
+    page.evaluate("setTimeout(() => { const end = performance.now() + 2000; while (performance.now() < end); }, 50)")
+    page.wait_for_timeout(100)
+    page.keyboard.press("Enter")
+    operator.until(lambda: page.locator("#notice").is_visible() or "disarm" in graph.actions)
+    assert "arm" not in graph.actions
+
+
 def test_without_the_token_every_control_is_off(browser: Browser, served: ServedConsole):
     context = browser.new_context(viewport=LAPTOP)
     watcher = Operator(context.new_page(), served, token=False)
@@ -418,6 +491,11 @@ def test_a_procedure_is_neither_begun_disarmed_nor_resumed_where_it_goes_on_by_i
     enabled(operator, "plan", "abort")
     graph.shown = procedure_state("paused", reason="the needle is not tracked: lost", resumes=True)
     enabled(operator, "pause", "abort")
+    waits = "the needle was not seen for more than 1.5 s: look, then resume"
+    graph.shown = procedure_state("paused", reason=waits)
+    enabled(operator, "run", "abort")
+    expect(operator.page.locator("#procedure-reason")).to_have_text(waits)
+    expect(operator.page.locator("#run-procedure")).to_have_text("Resume")
 
 
 @pytest.mark.parametrize("end", ["release", "blur", "stop"])
@@ -448,3 +526,13 @@ def test_the_page_is_held_while_the_button_is_and_no_longer(operator: Operator, 
     operator.until(lambda: operator.stats("states") > states + 5)
     assert len(graph.holds) == count
     page.mouse.up()
+
+
+def test_behind_the_path_of_a_proxy_the_socket_is_beside_the_page(browser: Browser, served: ServedConsole):
+    address, _, token = served.url.partition("#")
+    page = browser.new_page()
+    page.route("**/needle/*", lambda route: route.continue_(url=route.request.url.replace("/needle/", "/")))
+    with page.expect_websocket() as socket:
+        page.goto(f"{address}needle/#{token}")
+    assert socket.value.url.startswith(f"{address.replace('http', 'ws')}needle/socket?token=")
+    page.close()

@@ -10,7 +10,7 @@ import pytest
 from magnetosuture_thread.console.client import ClientMessage, RequestHandler
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.settings.errors import InvalidInputError
-from test.console.scene import RecordingGraph, RecordingHost
+from test.console.scene import RecordingGraph, RecordingHost, procedure_state
 from test.console.visitor import EAST, NORTH, REST, Console, run, until
 
 
@@ -56,6 +56,28 @@ def test_late_jog_messages_are_rejected_and_a_late_page_is_disconnected():
             await asyncio.sleep(0.02)
         assert NORTH not in here.graph.velocities
         await until(lambda: not here.server._clients)
+
+    run(test)
+
+
+def test_what_starts_something_is_refused_late_and_what_stops_is_not():
+    async def test(here: Console) -> None:
+        here.graph.shown = procedure_state()
+        page = await here.page()
+        await page.acquire_control()
+        await page.send(type="acknowledge", kind="state", sent=100.0)
+        planned = {"type": "procedure", "procedure": "hernia", "hold_to_run": False}
+        ask = {"type": "bridge_action"}
+        for what in ({**ask, "action": "arm"}, {**ask, "action": "reset"}, {**planned, "action": "resume"}):
+            assert "s late, expected at most 1 s" in await page.ask(**what, sent=98.9)
+        assert not here.graph.actions
+        assert not here.graph.procedures
+        for what in ({**ask, "action": "stop"}, {**ask, "action": "disarm"}, {**planned, "action": "abort"}):
+            assert await page.ask(**what, sent=0.0) == ""
+        for fastest, action in ((1e6, "reset"), (2e6, "arm")):
+            assert await page.ask(**ask, action=action, sent=fastest) == ""
+        assert here.graph.actions == ["stop", "disarm", "reset", "arm"]
+        assert [action for action, *_ in here.graph.procedures] == ["abort"]
 
     run(test)
 

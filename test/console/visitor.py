@@ -59,7 +59,9 @@ class Page:
                 await self.send(type="acknowledge", kind=what)
 
     async def send(self, **message: Any) -> None:
-        """Send a message."""
+        """Send a message; one that starts something has to say when it was pressed."""
+        if message.get("action") in ("arm", "reset", "resume"):
+            message.setdefault("sent", time.monotonic())
         await self.socket.send_str(json.dumps(message))
 
     async def ask(self, **message: Any) -> str:

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magnetosuture_thread.geometry.needle_arc import (
-    heading_angle,
-    heading_from_quaternion,
-    needle_axis,
-    yaw_quaternion,
-)
+from magnetosuture_thread.geometry.needle_arc import heading_angle, heading_from_quaternion, needle_axis, yaw_quaternion
 from magnetosuture_thread.settings.errors import InvalidInputError
 
 LENGTH = 0.007
@@ -39,21 +34,21 @@ def test_a_heading_comes_back_from_its_quaternion(angle: float):
     assert heading_angle(heading) == pytest.approx(angle, abs=1e-15)
 
 
-@pytest.mark.parametrize("size", [1.0, 0.9993, 1.0007])
+@pytest.mark.parametrize("size", [1.0, 0.9901, 1.0016, 1.0099])
 def test_of_a_tilted_needle_the_heading_is_that_of_its_projection(size: float):
     rotations = Rotation.random(20, rng=np.random.default_rng(1))
     for quaternion, along in zip(rotations.as_quat(), rotations.apply([1.0, 0.0, 0.0])[:, :2], strict=True):
         x, y, z, w = (size * quaternion).tolist()
         heading = heading_from_quaternion(x, y, z, w, "field")
         assert math.hypot(*heading) == pytest.approx(1.0, abs=1e-12)
-        assert heading == pytest.approx(along / np.linalg.norm(along), abs=1e-12 if size == 1.0 else 0.01)
+        assert heading == pytest.approx(along / np.linalg.norm(along), abs=1e-12)
 
 
 @pytest.mark.parametrize(
     ("quaternion", "words"),
     [
         ((0.0, 0.0, 0.0, 0.0), "norm 0"),
-        ((0.0, 0.0, 0.0, 1.002), "norm 1.002"),
+        ((0.0, 0.0, 0.0, 1.012), "norm 1.012"),
         ((1e300, 0.0, 0.0, 1e300), "expected a unit quaternion"),
         ((0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), "upright"),
     ],

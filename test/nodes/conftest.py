@@ -20,6 +20,7 @@ from rclpy.parameter import Parameter
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.processes import graph_environment, is_empty, reserved_domain
 from magnetosuture_thread.nodes.topics import Topic
+from magnetosuture_thread.settings.interface import PRESS_TIMEOUT
 from test.nodes.programs import Programs
 
 
@@ -91,6 +92,17 @@ class Graph:
         self.wait(client.service_is_ready, f"the service {name}")
         future = client.call_async(kind.Request(**fields))
         self.wait(future.done, f"an answer of {name}", timeout)
+        self.probe.destroy_client(client)
+        return future.result()
+
+    def call_late(self, kind: Any, name: str, **fields: Any) -> Any:
+        """Call a service while no callback runs, for longer than what a person has pressed counts."""
+        client = self.probe.create_client(kind, name)
+        self.wait(client.service_is_ready, f"the service {name}")
+        with self.between_callbacks():
+            future = client.call_async(kind.Request(**fields))
+            time.sleep(PRESS_TIMEOUT + 0.1)
+        self.wait(future.done, f"an answer of {name}")
         self.probe.destroy_client(client)
         return future.result()
 

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.msg import CoilBridgeState
+from magnetosuture_msgs.srv import GivePulse
+from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes import reading, topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.interface import Service
+from test.nodes import wire
 from test.nodes.bridge import (
+    EAST,
     LONG,
     READY,
+    TAIL,
     applied,
     arm,
     armed,
@@ -41,6 +49,12 @@ def test_it_starts_active_but_disarmed_and_arming_lets_commands_pass(graph):
     graph.wait(lambda: reasons(states).startswith("disarmed"), "the reason")
 
 
+def test_a_bridge_whose_driver_may_move_something_does_not_arm_itself(graph):
+    boards = {"roboclaw_ports": ["/dev/a", "/dev/b"], "roboclaw_addresses": [128, 129]}
+    with pytest.raises(ConfigurationError, match=r"coil_bridge\.autostart: got 'armed', expected active at most"):
+        graph.add(CoilBridgeNode, driver="roboclaw", autostart="armed", **boards, **READY)
+
+
 def test_an_emergency_stop_is_latched_and_a_reset_leaves_it_disarmed(graph):
     node = armed(graph, **LONG)
     states = graph.listen(topics.BRIDGE_STATE)
@@ -65,6 +79,21 @@ def test_an_emergency_stop_is_latched_and_a_reset_leaves_it_disarmed(graph):
     assert arm(graph).success
     drive(graph)
     graph.wait(lambda: applied(node)[-1].any(), "a current again")
+
+
+def test_a_late_arm_or_reset_is_refused_and_a_late_stop_or_disarm_is_not(graph):
+    node = graph.add(CoilBridgeNode, **LONG, **READY)
+    answer = graph.call_late(SetBool, Service.ARM, data=True)
+    assert not answer.success
+    assert "coils/arm: got a request 1." in answer.message
+    assert not node.system.latch.armed
+    assert arm(graph).success
+    assert graph.call_late(SetBool, Service.ARM, data=False).success
+    assert not node.system.latch.armed
+    assert graph.call_late(Trigger, Service.EMERGENCY_STOP).success
+    assert not graph.call_late(Trigger, Service.RESET).success
+    assert node.system.latch.emergency
+    assert press(graph, Service.RESET).success
 
 
 @pytest.mark.parametrize("how_far", ["unconfigured", "inactive"])
@@ -167,3 +196,61 @@ def test_a_bad_message_does_not_hide_an_emergency_stop(graph):
     graph.wait(lambda: len(diagnostics) > heard, "another report")
     assert diagnostics[-1].status[0].level == DiagnosticStatus.ERROR
     assert diagnostics[-1].status[0].message == "fault: emergency stop"
+
+
+def pulse(graph, duration: float = 0.5, currents: tuple[float, ...] = (0.1, 0.0, 0.0, 0.0)) -> Any:
+    """Ask for a pulse, of a needle that was just measured."""
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
+    return graph.call(GivePulse, Service.PULSE, current=currents, duration=duration)
+
+
+def pulsed(graph, node) -> None:
+    """Let a pulse begin; on a busy machine one pose may come too late."""
+    graph.wait(lambda: pulse(graph).success, "a pulse")
+    assert driven(node)
+
+
+def test_a_pulse_is_refused_unless_the_bridge_commissions(graph):
+    node = armed(graph, **LONG)
+    answer = pulse(graph)
+    assert not answer.success
+    assert answer.message.endswith("a bridge that does not commission, expected coil_bridge.commissioning true")
+    assert not driven(node)
+
+
+def test_a_bridge_that_commissions_gives_pulses_and_follows_no_command(graph):
+    node = armed(graph, commissioning=True, **LONG)
+    states, currents = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.CURRENTS)
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
+    graph.publish(topics.NEEDLE_COMMAND, command(graph))
+    graph.wait(lambda: reasons(states) == "needle/servo_cv commands the needle", "the reason")
+    assert "needle/servo_cv commands the needle" in pulse(graph).message
+    assert not driven(node)
+    graph.wait(lambda: reasons(states) == "no pulse", "the command to be old")
+    assert "expected 4 numbers of at most 10 A" in pulse(graph, currents=(11.0, 0.0, 0.0, 0.0)).message
+    assert "at most 0.5 s" in pulse(graph, 0.6).message
+    assert not driven(node)
+    pulsed(graph, node)
+    graph.wait(lambda: bool(currents) and currents[-1].stop == "the pulse is over", "its end")
+    flowing = [1e-9 * reading.nanoseconds(given.header.stamp) for given in currents if any(given.current)]
+    assert 0.1 < flowing[-1] - flowing[0] < 0.55  # s; a step reads two clocks, between which a busy machine may wait
+    assert arm(graph, on=False).success
+    assert "disarmed" in pulse(graph).message
+
+
+def test_a_stop_ends_a_pulse_at_once(graph):
+    node = armed(graph, commissioning=True, **LONG)
+    pulsed(graph, node)
+    assert press(graph, Service.EMERGENCY_STOP).success
+    assert not applied(node)[-1].any()
+    count = sum(currents.any() for currents in applied(node))
+    assert "emergency stop" in pulse(graph).message
+    assert sum(currents.any() for currents in applied(node)) == count
+
+
+def test_a_late_pulse_is_refused(graph):
+    node = armed(graph, commissioning=True, **LONG)
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
+    answer = graph.call_late(GivePulse, Service.PULSE, current=(0.1, 0.0, 0.0, 0.0), duration=0.1)
+    assert "coils/pulse: got a request 1." in answer.message
+    assert not driven(node)

@@ -43,6 +43,10 @@ def test_a_bridge_that_is_not_there_is_said(monkeypatch: pytest.MonkeyPatch, cap
     code, printed = press(capsys, "stop", "--namespace", "/lab2")
     assert code == 1
     assert "no coil_bridge" in printed
+    monkeypatch.undo()
+    code, printed = press(capsys, "arm", "--namespace", "/lab2")  # whoever waits for longer has looked away
+    assert code == 1
+    assert "no service coils/arm within 3 s" in printed
     with pytest.raises(SystemExit):
         press(capsys, "stop", "--namespace", "2 labs")
     assert "is no ROS namespace" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -27,6 +28,7 @@ from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.interface import PRESS_TIMEOUT, Service
 from test.nodes import wire
 
 
@@ -152,6 +154,21 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     assert np.abs(shown.astype(int) - pixels).max() < 12
 
 
+def test_an_arm_that_waited_for_the_bridge_does_not_arm_it(graph, console):
+    assert asyncio.run(console.execute_action("arm")) == "no service coils/arm within 1 s"
+    node = graph.add(CoilBridgeNode, scene="dish_35mm")
+    graph.wait(lambda: console.state() and console.services.ready(Service.ARM), "the bridge")
+    assert not node.system.latch.armed
+    with ThreadPoolExecutor(1) as page:
+        with graph.between_callbacks():
+            answer = page.submit(lambda: asyncio.run(console.execute_action("arm")))
+            time.sleep(2.0 * PRESS_TIMEOUT + 0.1)  # after the last repetition of the call too
+        assert "s old" in answer.result()
+    assert not node.system.latch.armed
+    assert asyncio.run(console.execute_action("arm")) == ""
+    assert node.system.latch.armed
+
+
 def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, console):
     """With the real needle planner, and somebody who shows a needle."""
     assert console.state()["procedure"] is None
@@ -163,6 +180,7 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     later = int(1e9 * (time.time() + 3600.0))  # ns; late poses are refused, however slowly the test runs
     pose = wire.pose_message(later, np.zeros(2), np.array([1.0, 0.0]))
     near = "goals: [{go_to: {position: [0.008, 0.0]}}]"
+    graph.wait(lambda: console.state() and console.services.ready(Service.RESUME_PROCEDURE), "the planner")
     refusal = asyncio.run(console.execute_procedure("resume", "", False))
     assert "no procedure" in refusal
 

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Twist
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -30,6 +32,7 @@ from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from test.nodes import wire
 from test.nodes.bridge import LONG, armed, drive, driven
+from test.nodes.conftest import own_context
 
 EVERY = (CoilBridgeNode, ThreadModelNode, RigSimulatorNode)  # two lifecycle nodes, and one without
 HOSTILE_NAMES = ("", " ", "no_such_parameter", "a..b", "\x1b[2J", "x" * 10_000, "use_sim_time.deep")
@@ -155,3 +158,15 @@ def test_a_message_that_is_too_large_is_refused_unread(graph, topic: topics.Topi
     graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
     graph.wait(lambda: "expected at most" in str(reports[-1].status[0].values), "the reason")
     assert max(len(str(report)) for report in reports) < 5000
+
+
+def test_a_publisher_of_another_type_is_named(graph):
+    """As of a joystick that sends a Twist where a TwistStamped is expected: the middleware says nothing."""
+    graph.add(CoilBridgeNode, scene="dish_35mm")
+    reports = graph.listen(topics.DIAGNOSTICS)
+    expected = "got geometry_msgs/msg/Twist from /joystick", "expected geometry_msgs/msg/TwistStamped"
+    with own_context(graph.domain) as elsewhere:  # a participant refuses two types of one topic by itself
+        joystick = rclpy.create_node("joystick", context=elsewhere)
+        joystick.create_publisher(Twist, topics.OPERATOR_COMMAND.name, 10)
+        graph.wait(lambda: any(all(text in str(report) for text in expected) for report in reports), "the type")
+        joystick.destroy_node()

@@ -16,13 +16,14 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import SafetyMargins
+from magnetosuture_msgs.msg import BarrierMargin, SafetyMargins
 from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.bags import packing, reading
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -30,6 +31,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.thread.barriers import SelfContact
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.prediction import Prediction
@@ -285,3 +287,8 @@ def test_the_bags_and_the_graph_have_the_same_own_messages():
     for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
+
+
+def test_every_barrier_of_this_package_is_a_constant_of_its_message():
+    names = (*BUILT_IN, SelfContact.name)
+    assert {name: getattr(BarrierMargin, name.upper(), None) for name in names} == {name: name for name in names}

@@ -46,7 +46,8 @@ class Bench:
     """An ideal needle that moves as the planner commands, and a thread that is known as the test wants it."""
 
     def __init__(self, graph: Any, scene: Scene = OPEN, **parameters: Any) -> None:
-        given: dict[str, Any] = {"needle_length": NEEDLE.length, "keep_out": 2.5e-4, "settle": 0.0, **parameters}
+        own = {"needle_length": NEEDLE.length, "keep_out": 2.5e-4, "settle": 0.0}
+        given: dict[str, Any] = {**own, "pose_timeout": 1.0, **parameters}  # a busy machine shows it slowly
         self.graph, self.scene = graph, scene
         self.node = graph.add(NeedlePlannerNode, **given)
         self.commands, self.states = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.PROCEDURE_STATE)
@@ -220,6 +221,25 @@ def test_any_command_of_the_operator_pauses_until_it_is_resumed(graph, make_benc
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
+def test_what_is_late_neither_begins_nor_goes_on_and_pauses_all_the_same(graph, make_bench):
+    bench = make_bench(pose_timeout=5.0, thread_timeout=5.0)
+    pressed = graph.now()
+    pressed.sec -= 2
+    status, result = bench.result(bench.send(FAR, stamp=pressed))
+    assert status == GoalStatus.STATUS_ABORTED
+    assert "execute_procedure: got a request 2." in result.reason
+    assert not bench.commands
+    goal = bench.run(stamp=graph.now())
+    assert graph.call_late(Trigger, Service.PAUSE_PROCEDURE).success
+    answer = graph.call_late(Trigger, Service.RESUME_PROCEDURE)
+    assert not answer.success
+    assert "procedure/resume: got a request 1." in answer.message
+    assert bench.is_in(ProcedureState.STATE_PAUSED)
+    assert bench.rests()
+    assert bench.call(Service.RESUME_PROCEDURE).success
+    assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
 def disturbed(calm: bool) -> EstimatedThread:
     found = [] if calm else [ThreadDisturbance(arc_length=0.01, force=2e-4, direction=Vector3(x=1.0))]
     return EstimatedThread(positions=THREAD, disturbances=found)
@@ -252,7 +272,7 @@ def test_what_is_not_known_pauses_and_it_goes_on_by_itself_once_it_is(graph, mak
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
-SILENT = "no needle pose for more than 0.2 s"
+SILENT = "no needle pose for more than 1 s"
 
 
 @pytest.mark.parametrize(
@@ -261,7 +281,7 @@ SILENT = "no needle pose for more than 0.2 s"
 )
 def test_without_poses_it_pauses(graph, make_bench, without: str, reason: str):
     """Late ones are as none: their commands would be stamped as of now."""
-    bench = make_bench(pose_timeout=0.2)
+    bench = make_bench()
     goal, ahead = bench.run(), bench.begin
     if without == "lost":
         graph.publish(topics.TRACKER_STATE, TrackerState(state=TrackerState.STATE_LOST, reason="two needles"))
@@ -273,6 +293,19 @@ def test_without_poses_it_pauses(graph, make_bench, without: str, reason: str):
     bench.begin = ahead
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
+def test_after_a_long_time_without_poses_it_waits_for_a_person(graph, make_bench):
+    bench = make_bench()
+    bench.run()
+    graph.wait(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "was not seen for more than 3 s"), "the pause")
+    assert not bench.state().resumes
+    refusal = graph.call(Trigger, Service.RESUME_PROCEDURE)
+    assert refusal.message == "resume: got the needle was not seen for more than 3 s, expected a needle that is tracked"
+    assert bench.rests()  # the needle is known again
+    assert bench.is_in(ProcedureState.STATE_PAUSED, "was not seen for more than 3 s: look, then resume")
+    assert bench.call(Service.RESUME_PROCEDURE).success
+    bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "it to go on")
 
 
 def test_a_bridge_that_is_disarmed_pauses_until_it_is_resumed(graph, make_bench):

@@ -130,6 +130,19 @@ def test_what_a_node_cannot_start_with_is_said_in_one_line(
     assert "Traceback" not in process.output
 
 
+@pytest.mark.parametrize(("variable", "value"), [("ROS_LOG_DIR", "/dev/null/logs"), ("ROS_DOMAIN_ID", "two")])
+@pytest.mark.parametrize("program", ["nodes.program scene_server", "cli coils state"])
+def test_an_environment_in_which_ros_cannot_start_is_named_in_one_line(
+    environment, program: str, variable: str, value: str
+):
+    command = [sys.executable, "-m", *f"magnetosuture_thread.{program}".split()]
+    changed = {**environment, variable: value}
+    done = subprocess.run(command, env=changed, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert variable in done.stderr
+
+
 def until(condition: Callable[[], bool]) -> None:
     """Wait until a condition holds."""
     deadline = time.monotonic() + TIMEOUT

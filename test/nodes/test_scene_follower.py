@@ -61,6 +61,7 @@ def test_the_scene_of_the_file_is_in_force_until_another_comes(graph, node):
     assert node.follower.scene == POST
     publish(graph, POST)  # the scene server has read the same file
     publish(graph, HERNIA)
+    graph.wait(lambda: node.follower.version == HERNIA.version, "the next scene")
     publish(graph, every_shape())
     graph.wait(lambda: node.follower.version == every_shape().version, "the last scene")
     assert node.changes == [HERNIA, every_shape()]

@@ -71,11 +71,3 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph, bench: Bench):
     bench.show(3)
     assert bench.predicted[-1].material == "silk_6_0"
     assert bench.node.settings.rest_curvature == 20.0
-
-
-def test_a_refused_parameter_leaves_all_as_it_was(bench: Bench):
-    bench.show(2)
-    before = bench.node.settings
-    assert "longer than thick" in bench.set(segments=400, viscosity=0.3)
-    assert bench.node.settings is bench.node._session.settings is before
-    bench.show(2)

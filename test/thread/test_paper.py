@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,7 +105,7 @@ def test_a_step_that_ends_deep_in_an_obstacle_says_so():
 
 def test_a_thread_that_its_slacks_let_grow_is_not_converged():
     thread = polyamide()
-    soft = PaperOptions.tuned(0.01)._replace(connectivity_weight=1e-6)
+    soft = replace(PaperOptions.tuned(0.01), connectivity_weight=1e-6)
     formulation = formulated(thread, name="paper", paper=soft)
     done = followed(formulation, straight(thread), lambda k: k * 4e-4 * east(), 100)[-1]
     assert not done.converged

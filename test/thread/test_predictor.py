@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -112,6 +114,24 @@ def test_driven_nodes_that_cannot_be_are_refused(prescribed: dict[int, np.ndarra
         started().step(pose(0.1), prescribed)
     with pytest.raises(InvalidInputError, match="fixed node"):
         new(fixed_nodes=(26,))
+
+
+def test_margins_do_not_depend_on_what_was_near_before():
+    """The nearest edge of a polygon is looked for where it was in the margins before."""
+    around = 2.0 * np.pi * np.arange(200) / 200
+    star = 3e-3 * (1.0 + 0.3 * np.cos(9.0 * around))[:, None] * np.column_stack([np.cos(around), np.sin(around)])
+    shapes = Polygon(tuple(map(tuple, star.tolist()))), Polygon(((5e-3, 0.0), (6e-3, -1e-3), (6e-3, 1e-3)))
+    used = new(shapes)
+    for k, angle in enumerate(np.linspace(0.0, 5.0, 12)):
+        heading = np.array([np.cos(angle), np.sin(angle)])
+        nodes = 5e-3 * heading[::-1] - THREAD.segment_length * np.arange(THREAD.segments + 1.0)[:, None] * heading
+        at = NeedlePose(float(k), nodes[0], heading)
+        known, fresh = (predictor.start_at(at, nodes).margins["obstacle"] for predictor in (used, new(shapes)))
+        assert len(fresh) > 0
+        for name in ("node", "obstacle", "value", "clearance", "normal"):
+            np.testing.assert_array_equal(getattr(known, name), getattr(fresh, name))
+        distance = Workspace(shapes, 5e-3).near(nodes)
+        np.testing.assert_allclose(fresh.value, distance.distance[distance.nearest] - 0.5 * THREAD.diameter, atol=1e-15)
 
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
@@ -225,7 +245,7 @@ def test_any_thread_at_any_times_stays_whole(
         assert np.abs(prediction.strain).max() < 5e-2
 
 
-@pytest.mark.parametrize("twin", [copy.deepcopy, lambda predictor: pickle.loads(pickle.dumps(predictor))])
+@pytest.mark.parametrize("twin", [copy.deepcopy, copy.copy, lambda predictor: pickle.loads(pickle.dumps(predictor))])
 def test_a_copy_of_a_predictor_goes_on_alike_and_leaves_the_original_alone(twin: Callable[[Any], Any]):
     predictor, other = started((Disc((-0.005, 0.002), 0.0015),)), started((Disc((-0.005, 0.002), 0.0015),))
     for k in range(1, 20):
@@ -238,3 +258,24 @@ def test_a_copy_of_a_predictor_goes_on_alike_and_leaves_the_original_alone(twin:
     for original in (copied, predictor):
         found = [original.step(pose(0.02 * k, 0.0, 1e-4 * k)).positions for k in range(20, 24)]
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("stamp", [np.float32(0.5), np.longdouble(0.5), np.array(0.5), np.array(1), np.int64(1), 1])
+def test_a_stamp_may_be_a_number_of_any_library(stamp: Any):
+    assert ThreadPredictor(THREAD).start(replace(pose(0.0), stamp=stamp)).stamp == float(stamp)
+
+
+@pytest.mark.parametrize("stamp", [True, np.array([0.5]), np.bool_(True), "0.5", None, np.float32("nan")])
+def test_what_is_no_number_is_no_stamp(stamp: Any):
+    with pytest.raises(InvalidInputError, match=r"needle pose stamp: got .+ a finite time"):
+        ThreadPredictor(THREAD).start(replace(pose(0.0), stamp=stamp))
+
+
+def test_a_heading_is_normalised_within_one_per_cent():
+    exact = pose(0.0, angle=math.atan2(0.8, 0.6))
+    for factor in (0.991, 1.0016, 1.009):
+        np.testing.assert_allclose(replace(exact, heading=factor * exact.heading).heading, [0.6, 0.8], rtol=1e-15)
+    assert replace(exact, heading=exact.heading).heading is exact.heading
+    for factor in (0.98, 1.02, 0.0):
+        with pytest.raises(InvalidInputError, match=f"norm {factor:g}, expected a unit vector"):
+            ThreadPredictor(THREAD).start(replace(exact, heading=factor * exact.heading))

@@ -1,6 +1,6 @@
 // Operator page: connects the WebSocket, the jog input, the drawing and the panel.
 
-import { Connection } from "./connection.js";
+import { Connection, SILENCE_TIMEOUT } from "./connection.js";
 import { Dish } from "./dish.js";
 import { Input } from "./input.js";
 import { showPanel } from "./panel.js";
@@ -8,7 +8,7 @@ import { Plots } from "./plots.js";
 import { ProcedureBar } from "./procedure.js";
 import { Ruler } from "./ruler.js";
 import { SetupPicker } from "./setup_picker.js";
-import { SILENCE_TIMEOUT, undirectedAxis } from "./status.js";
+import { undirectedAxis } from "./status.js";
 
 const JOG_PERIOD = 30; // [ms] between two jog messages
 const PANEL_PERIOD = 100; // [ms]
@@ -28,7 +28,7 @@ const clock = () => performance.now() / 1000;
 const state = {
   link: "connecting", problem: "", graph: null, host: null, lease: null, received: 0, client: null, canCommand: false,
   speed: 0.003, maxSpeed: 0.01, adjusted: false, jogging: false, stopped: false, showTension: false,
-  late: { delay: 0, at: 0 },
+  late: { delay: 0, at: 0 }, stopSent: null, stopDoubted: false,
 };
 const dish = new Dish(find("dish"));
 const plots = new Plots(document);
@@ -38,13 +38,13 @@ const input = new Input(find("dish"), find("directions"), {
 const ruler = new Ruler(find("dish"), drawSoon, () => dish.placement);
 const connection = new Connection({ opened, closed, received, frame });
 
-const procedure = new ProcedureBar((message) => connection.send(message));
+const procedure = new ProcedureBar((message, at) => connection.send(message, at));
 
 const since = () => (state.graph ? clock() - state.received : 0);
 const hasControl = () => state.link === "open" && state.canCommand && state.client !== null && state.lease?.holder === state.client;
 
 function opened() {
-  Object.assign(state, { link: "open", problem: "", client: null });
+  Object.assign(state, { link: "open", problem: "", client: null, stopSent: null, stopDoubted: false });
   drawSoon();
   connection.send({ type: "visibility", visible: !document.hidden });
 }
@@ -64,7 +64,10 @@ function received(message) {
     if (message.refusal) notice(message.refusal);
   } else if (message.type === "error" && message.delay) state.late = { delay: message.delay, at: clock() };
   else if (message.type === "error") notice(message.text);
-  else if (message.type === "result" && message.refusal) notice(`${message.request}: ${message.refusal}`);
+  else if (message.type === "result") {
+    if (message.request === "stop") stopAnswered();
+    if (message.refusal) notice(`${message.request}: ${message.refusal}`);
+  }
 }
 
 function newState(message) {
@@ -74,6 +77,7 @@ function newState(message) {
   drawSoon();
   plots.add(message.graph, state.received);
   const stopped = Boolean(message.graph.bridge?.emergency_stopped);
+  if (stopped) stopAnswered();
   if (stopped && !state.stopped) input.clear();
   state.stopped = stopped;
 }
@@ -96,7 +100,7 @@ async function frame(buffer) {
 function sendJog() {
   const [x, y] = hasControl() && since() <= SILENCE_TIMEOUT ? input.direction() : [0, 0];
   if (x || y) {
-    state.jogging = connection.send({ type: "jog", direction: [x, y], speed: state.speed, sent: clock() });
+    state.jogging = connection.send({ type: "jog", direction: [x, y], speed: state.speed });
   } else if (state.jogging) {
     state.jogging = false;
     connection.send({ type: "end_jog" });
@@ -106,7 +110,22 @@ function sendJog() {
 function emergencyStop() {
   input.clear();
   procedure.release();
-  if (!connection.send({ type: "bridge_action", action: "stop" })) notice("Not connected: the emergency stop was not sent. Use the one on the rig.");
+  state.stopSent = connection.isOpen ? clock() : null;
+  if (!connection.isOpen) return notice("Not connected: the emergency stop was not sent. Use the one on the rig.");
+  connection.send({ type: "bridge_action", action: "stop" });
+  doubtStop();
+}
+
+// Say of an emergency stop that it may not have arrived, until something tells that it has.
+function doubtStop() {
+  if (state.stopSent === null || Math.max(connection.silence, clock() - state.stopSent) <= SILENCE_TIMEOUT) return;
+  notice("The emergency stop may not have arrived: no answer. Use the one on the rig.");
+  state.stopDoubted = true;
+}
+
+function stopAnswered() {
+  if (state.stopDoubted) find("notice").hidden = true;
+  Object.assign(state, { stopSent: null, stopDoubted: false });
 }
 
 let noticeTimer = 0;
@@ -125,8 +144,8 @@ function setSpeed(speed) {
 }
 
 // A button that is disabled as it has done its work would leave the focus nowhere.
-const request = (id, message) => find(id).addEventListener("click", () => {
-  connection.send(message());
+const request = (id, message) => find(id).addEventListener("click", ({ timeStamp }) => {
+  connection.send(message(), timeStamp);
   find("dish").focus({ preventScroll: true });
 });
 find("stop").addEventListener("click", emergencyStop);
@@ -205,6 +224,7 @@ function update() {
     input.clear(); // no jogging without a current state
     drawSoon();
   }
+  doubtStop();
   document.body.dataset.link = state.link;
   const view = {
     link: state.link, open: state.link === "open", problem: state.problem, since: since(), graph: state.graph, host: state.host,
@@ -219,7 +239,7 @@ function update() {
 setInterval(() => {
   input.poll();
   sendJog();
-  procedure.poll(clock());
+  procedure.poll();
   if (input.pointer) drawSoon();
 }, JOG_PERIOD);
 setInterval(update, PANEL_PERIOD);

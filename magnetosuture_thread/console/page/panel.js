@@ -2,7 +2,8 @@
 
 import { capital, isNumber, leastClearance, micronewtons, millimetres, plural, seconds } from "./format.js";
 import { estimateState, forecastOf, threadOf } from "./colours.js";
-import { SILENCE_TIMEOUT, motionStatus, slowness } from "./status.js";
+import { SILENCE_TIMEOUT } from "./connection.js";
+import { motionStatus, slowness } from "./status.js";
 
 const NODE_TIMEOUT = 3.0; // [s]
 const KINDS = { connectivity: "Connectivity", compression: "Compression", obstacle: "Obstacle", wall: "Wall" };

@@ -9,14 +9,14 @@ const find = (id) => document.getElementById(id);
 const kind = (goal) => capital(goal.replaceAll("_", " "));
 
 export class ProcedureBar {
-  // send(message) sends to the server.
+  // send(message, at) sends to the server; see Connection.
   constructor(send) {
     this.send = send;
     this.chosen = "";
     this.holdToRun = false;
     this.held = false;
-    const act = (id, action) => find(id).addEventListener("click", () => {
-      this.send({ type: "procedure", action: action(), procedure: this.chosen, hold_to_run: this.holdToRun });
+    const act = (id, action) => find(id).addEventListener("click", ({ timeStamp }) => {
+      this.send({ type: "procedure", action: action(), procedure: this.chosen, hold_to_run: this.holdToRun }, timeStamp);
       find("dish").focus({ preventScroll: true });
     });
     act("plan-procedure", () => "plan");
@@ -41,9 +41,9 @@ export class ProcedureBar {
   }
 
   // Called as often as a jog would be sent.
-  poll(sent) {
+  poll() {
     if (this.held && !document.hasFocus()) this.release(); // some of the browser's own popups take it without an event
-    if (this.held) this.send({ type: "hold", sent });
+    if (this.held) this.send({ type: "hold" });
   }
 
   show({ graph, open, hasControl, canCommand }) {

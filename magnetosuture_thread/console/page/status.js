@@ -1,9 +1,9 @@
 // Status headline: whether the needle moves, and why not. The first matching reason is the first to resolve, and a command
 // that yields no motion always has one.
 
+import { SILENCE_TIMEOUT } from "./connection.js";
 import { capital, isNumber, length, plural, seconds, speedText } from "./format.js";
 
-export const SILENCE_TIMEOUT = 1.0; // [s] after which states of bridge, needle and camera are stale
 const NODE_TIMEOUT = 3.0; // [s] after which the diagnostics of a node are
 const MIN_SPEED = 1e-5; // [m/s]
 const MIN_REAL_TIME_FACTOR = 0.9; // below which a machine is too slow

@@ -14,9 +14,7 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
-from test.thread.worlds import polygon, scene_with
-
-SQUARE = polygon(0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01)
+from test.thread.worlds import scene_with
 
 
 def made(**values: Any) -> ThreadModelSettings:
@@ -45,30 +43,6 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
     with pytest.raises(ConfigurationError, match=words) as caught:
         made(**values)
     assert "thread_model." in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {},
-        {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
-        {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
-        {"fixed_nodes": [20], "rest_curvature": 30.0, "attachment_offset": [1e-3, 5e-4], "flow": [1e-3, -2e-3]},
-        {"solver": "osqp", "attachment": "clamped", "drag_anisotropy": 1.0, "margin_range": 0.02},
-    ],
-)
-def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
-    predictor = made(**values).predictor(scene_with(SQUARE, diameter=0.06))
-    assert not predictor.started
-    east = np.array([1.0, 0.0])
-    tail = np.array([-0.005, -0.005])
-    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
-    for k in range(1, 6):
-        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * 5e-5 * east, east))
-    assert prediction.formulation == values.get("formulation", "rod")
-    assert prediction.solver == values.get("solver", "banded")
-    assert np.isfinite(prediction.positions).all()
-    assert prediction.residual < 1e-6
 
 
 def test_a_scene_that_the_segments_do_not_resolve_is_refused():
