@@ -18,11 +18,10 @@ from magnetosuture_thread.geometry.compiled import PACKAGE
 ROOT = Path(__file__).resolve().parent.parent
 # Tests with kernels that no setup has: in space, which share hardly any with the setups, ...
 IN_SPACE = ("test/test_examples.py::test_an_example_runs[ball_in_space]",)
-# ... and of the other formulations, of needle and rod, and of forecasts in batches, which share most.
+# ... and of the other formulations, and of forecasts in batches, which share most.
 BESIDES = (
     "test/calibration/test_search.py::test_the_paper_s_numbers_are_fitted_too",
     "test/thread/test_self_contact.py::test_the_rows_are_the_distances_of_nodes_from_segments",
-    "test/rig/mechanics/test_rod.py::test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives",
     "test/test_documentation.py::test_python_examples_run",
 )
 

@@ -21,6 +21,10 @@ BENCHMARKS = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark that is named; 1 if it failed or did not pass, 2 for wrong use."""
+    return exit_code(lambda: _run(_parse(arguments)))
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__, epilog=command.EXIT_CODES)
     names = parser.add_subparsers(title="benchmarks", metavar="NAME", required=True)
     for name in BENCHMARKS:
@@ -32,8 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help_json = "write the figures to a file (-: to standard output)"
         subparser.add_argument("--json", type=command.output_file, metavar="FILE", help=help_json)
         subparser.set_defaults(run=module.run)
-    options = parser.parse_args(arguments)
-    return exit_code(lambda: _run(options))
+    return parser.parse_args(arguments)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -63,7 +63,7 @@ class ProcedureControl:
         if session.status.state is None and not condition.problem:
             session.on_pose(stamp, tail, heading, stamp)
             session.plan(self._procedure, stamp)
-            session.resume()
+            session.resume(stamp)
         velocity = session.on_pose(stamp, tail, heading, stamp)
         return np.zeros(3) if velocity is None else velocity
 
@@ -74,8 +74,7 @@ def run_loop(name: str, seed: int) -> tuple[Setup, LoopRecord]:
     setup = read_procedure_setup(procedure)
     control, variation = ProcedureControl(procedure, setup), vary(setup, seed)
     record, rig = LoopRecord(control.session.new_plan), Rig(variation.setup.rig, setup.scene)
-    truth: dict[str, Any] = {"losses": variation.losses, "coil_gains": variation.coil_gains}
-    loop = ClosedLoop(setup, rig, control, seed, recorder=record, **truth)
+    loop = ClosedLoop(setup, rig, control, seed, recorder=record, losses=variation.losses)
     while loop.now < START + 100.0 and not control.done:
         loop.step()
     return setup, record

@@ -33,6 +33,14 @@ RIG_NODES = ("rig_simulator", "path_follower")
 LIFECYCLE_NODES = ("scene_server", "perception", "coil_bridge", "needle_planner", "path_follower")
 RESPAWNED = ("perception", "console")
 RESPAWN_DELAY = 2.0  # s
+SWITCHED = {
+    "use_sim_time": "take the time from /clock",
+    "simulated": "with a rig in software",
+    "planner": "with the needle planner, in place of the path follower",
+    "console": "with the operator's page",
+    "enclaves": "each process in the SROS2 enclave of its name",
+}
+TRUTH = {"true": True, "1": True, "false": False, "0": False}  # in any case, as launch's conditions take them
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -47,17 +55,13 @@ def generate_launch_description() -> LaunchDescription:
     def argument(name: str, default: str, description: str, **options: object) -> DeclareLaunchArgument:
         return DeclareLaunchArgument(name, default_value=default, description=description, **options)
 
-    def switch(name: str, description: str) -> DeclareLaunchArgument:
-        return argument(name, "false", description, choices=["true", "false", "True", "False"])
-
     def nodes(context: LaunchContext) -> list[Node]:
         given = LaunchConfiguration("setup_file").perform(context)
         file = Path(given).expanduser() if given else folder / f"{LaunchConfiguration('setup').perform(context)}.yaml"
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
         autostart = LaunchConfiguration("autostart").perform(context)
-        switches = (LaunchConfiguration(name).perform(context).lower() for name in ("planner", "enclaves"))
-        planner, enclaves = (value == "true" for value in switches)
+        on = {name: is_on(name, LaunchConfiguration(name).perform(context)) for name in SWITCHED}
         frame, prefix = (LaunchConfiguration(name).perform(context) for name in ("parent_frame", "frame_prefix"))
         inner = LaunchConfiguration("namespace").perform(context)
         # As launch_ros does it: what a group pushes comes before, but not before an absolute namespace.
@@ -65,9 +69,9 @@ def generate_launch_description() -> LaunchDescription:
         outer = [part for part in f"{pushed}/{inner}".split("/") if part]
 
         def ros_arguments(name: str) -> list[str]:
-            return ["--enclave", "/" + "/".join([*outer, name])] if enclaves else []
+            return ["--enclave", "/" + "/".join([*outer, name])] if on["enclaves"] else []
 
-        robot = started(str(file.resolve()), autostart, planner, prefix, ros_arguments)
+        robot = started(str(file.resolve()), autostart, on, prefix, ros_arguments)
         return [*robot, *transforms(frame, prefix, ros_arguments)]
 
     return LaunchDescription(
@@ -87,25 +91,28 @@ def generate_launch_description() -> LaunchDescription:
                 os.environ.get("MAGNETOSUTURE_FRAME_PREFIX", "").lstrip("/"),
                 "before the frames dish and camera, for example left/",
             ),
-            switch("use_sim_time", "take the time from /clock"),
-            switch("simulated", "with a rig in software"),
-            switch("planner", "with the needle planner, in place of the path follower"),
-            switch("console", "with the operator's page"),
-            switch("enclaves", "each process in the SROS2 enclave of its name"),
+            *(argument(name, "false", f"{text} (true or false)") for name, text in SWITCHED.items()),
             OpaqueFunction(function=nodes),
         ]
     )
 
 
+def is_on(name: str, text: str) -> bool:
+    """Return the value of a switch."""
+    if text.strip().lower() not in TRUTH:
+        raise ValueError(f"{name}: got {text!r}, expected true or false")
+    return TRUTH[text.strip().lower()]
+
+
 def started(
-    file: str, autostart: str, planner: bool, prefix: str, ros_arguments: Callable[[str], list[str]]
+    file: str, autostart: str, on: dict[str, bool], prefix: str, ros_arguments: Callable[[str], list[str]]
 ) -> list[Node]:
     """Return the nodes with a parameter file.
 
     Args:
         file: the setup.
         autostart: state that the lifecycle nodes enter by themselves; empty: as the setup says.
-        planner: whether the needle planner is among them, in place of the path follower.
+        on: the switches.
         prefix: of the rig's frames.
         ros_arguments: of a node, by its name.
     """
@@ -120,7 +127,7 @@ def started(
             executable=name,
             name=name if named else None,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[file, {"use_sim_time": LaunchConfiguration("use_sim_time")}, *more],
+            parameters=[file, {"use_sim_time": on["use_sim_time"]}, *more],
             ros_arguments=ros_arguments(name),
             additional_env={"MAGNETOSUTURE_FRAME_PREFIX": prefix},
             output="screen",
@@ -136,8 +143,8 @@ def started(
         node("coil_bridge", condition=without),
         node("coil_bridge", {"driver": "simulated", "autostart": "armed"}, condition=with_rig),
         # Two nodes that command the needle would be in each other's way.
-        *(node(name, condition=with_rig) for name in RIG_NODES if not (planner and name == "path_follower")),
-        *([node("needle_planner")] if planner else []),
+        *(node(name, condition=with_rig) for name in RIG_NODES if not (on["planner"] and name == "path_follower")),
+        *([node("needle_planner")] if on["planner"] else []),
         node("console", condition=with_console),
     ]
 

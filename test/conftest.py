@@ -52,12 +52,6 @@ def state_home(monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.fixture
-def view() -> DishView:
-    """Where the rendered dish is."""
-    return VIEW
-
-
 @pytest.fixture(scope="session")
 def camera() -> DishCamera:
     """A camera over an empty dish."""

@@ -1,4 +1,4 @@
-"""Every benchmark that the pages name is run once, by its command, with small arguments."""
+"""Every benchmark that the pages name is run once, by its command; with small arguments those that take long."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from benchmarks.page import BROWSERS
 ROOT = Path(__file__).parents[1]
 DOCUMENTED = re.compile(r"python -m benchmarks ([\w-]+)")
 SMALL = {
-    "solver": "--segments 12",
+    "solver": "",
     "contact": "--motions 2 --segments 40",
     "forecast": "--repeats 2 --loops",
     "vision": "--count 1 --classes usual",
@@ -77,6 +77,12 @@ def test_a_benchmark_of_a_graph_runs_as_its_page_says(name: str, tmp_path: Path)
     if name == "network" and not IS_ROOT:
         pytest.skip("needs root and /dev/net/tun")
     run(name, GRAPHS[name], tmp_path)
+
+
+def test_a_benchmark_runs_whatever_backend_a_notebook_asks_for():
+    command = [sys.executable, "-m", "benchmarks", "keep-out", "--seconds", "0"]
+    environment = {**os.environ, "MPLBACKEND": "there_is_none"}
+    subprocess.run(command, env=environment, check=True, timeout=TIMEOUT, cwd=ROOT, stdout=subprocess.PIPE)
 
 
 def test_wrong_use_is_2_and_figures_go_to_standard_output_alone(capsys: pytest.CaptureFixture[str]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -37,7 +38,13 @@ def test_help_waits_for_no_package_of_a_command():
 WRONG = [
     *("", "dance", "replay bag", "replay bag --output out --rate fast", "replay bag --output out --rate nan"),
     *("render r.npz --output out --setup dish_50mm --seed -1", "simulate dish_50mm --output out --duration -1"),
-    *("reproduce", "console --graph --replay bag", "console --port some", "track frames --centre 1"),
+    *(
+        "reproduce",
+        "console --graph --replay bag",
+        "console --port some",
+        "track frames --centre 1",
+        "track frames --needle-bright 0.5",
+    ),
     *("evaluate dir --formulation magic", "evaluate dir --segments 2", "evaluate dir --json /no/such/folder/x.json"),
 ]
 
@@ -65,6 +72,17 @@ def test_a_failed_job_is_one_line(tmp_path: Path, monkeypatch, capsys, arguments
     assert errors.startswith(words)
     assert errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_signs_that_a_terminal_lacks_end_nothing(encoding: str):
+    """As of a container without a locale: results would be lost with them."""
+    code = "import sys; from magnetosuture_thread.cli import exit_code; sys.exit(exit_code(lambda: print('µ ✓') or 0))"
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    shown = subprocess.run(
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, timeout=300, check=True
+    )
+    assert shown.stdout.decode(encoding) == "µ ✓\n".encode(encoding, "backslashreplace").decode(encoding)
 
 
 def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path, short_bag: Path):

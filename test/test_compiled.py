@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-from magnetosuture_thread.geometry.compiled import source_digest
+from magnetosuture_thread.geometry.compiled import compiled_inline, source_digest
 
 
 def test_the_digest_of_kernels_is_of_every_file_that_they_depend_on(tmp_path: Path):
@@ -59,10 +60,61 @@ def test_code_of_before_is_not_run_and_nothing_has_to_be_writable(tmp_path: Path
     places = {"NUMBA_CACHE_DIR": str(cache)}
     results = [run("2.0", **places), run("2.0", **places), run("4.0", **places)]
     assert results == ["42.0 True", "42.0 False", "84.0 True"]
+    for kept in ("nbi", "nbc"):  # emptied, as by a power cut
+        for file in cache.rglob(f"*.{kept}"):
+            file.write_bytes(b"")
+        assert [run("4.0", **places) for _ in range(2)] == ["84.0 True", "84.0 False"]
     (tmp_path / "__pycache__").write_text("a file where a folder should be")
     nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME"), "/dev/null")
     nowhere["NUMBA_CACHE_DIR"] = "/dev/null/cache"
     assert run("2.0", **nowhere) == "42.0 True"
+    full = f"ulimit -f 1; exec {sys.executable} {script}"  # no file can have more than some hundred bytes
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "full")}
+    done = subprocess.run(["sh", "-c", full], env=environment, check=True, timeout=600, stdout=subprocess.PIPE)
+    assert done.stdout == b"42.0 True\n"
+
+
+INNER = """
+from magnetosuture_thread.geometry.compiled import compiled_inner, compiled_uncounted
+
+@compiled_inner
+def double(x: float) -> float:
+    return 2.0 * x
+
+@compiled_uncounted
+def outer(x: float) -> float:
+    return double(x) + 1.0
+
+print(outer(21.0), double(21.0), outer(21.0), double(21.0))
+"""
+
+
+def test_a_kernel_without_a_wrapper_can_be_called_from_python(tmp_path: Path):
+    """By numba itself that is a crash of the process."""
+    (tmp_path / "inner.py").write_text(INNER)
+    done = subprocess.run([sys.executable, tmp_path / "inner.py"], check=True, timeout=600, stdout=subprocess.PIPE)
+    assert done.stdout == b"43.0 42.0 43.0 42.0\n"
+
+
+def test_without_jit_the_same_is_predicted(tmp_path: Path):
+    """As NUMBA_DISABLE_JIT asks for, to step through it in a debugger."""
+    code = """
+import pickle
+from magnetosuture_thread import NeedlePose, ThreadPredictor
+
+predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=10)
+predictor.start(NeedlePose(0.0, (0.0, 0.0), (1.0, 0.0)))
+prediction = pickle.loads(pickle.dumps(predictor)).step(NeedlePose(0.02, (0.0, 1e-4), (0.6, 0.8)))
+print(prediction.converged, prediction.positions.round(12).tolist(), prediction.tension.round(12).tolist())
+"""
+    shown = []
+    for switch in ("0", "1"):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": switch}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, check=True, timeout=600, stdout=subprocess.PIPE, text=True)
+        shown.append(done.stdout)
+    assert shown[0] == shown[1]
+    assert shown[0].startswith("True ")
 
 
 def test_a_second_start_compiles_nothing():
@@ -85,3 +137,19 @@ print(count, len(compilations.buffer) > count)
     for _ in range(2):
         done = subprocess.run(command, check=True, timeout=300, stdout=subprocess.PIPE, text=True)
     assert done.stdout == "0 True\n"
+
+
+def test_a_number_that_is_written_out_compiles_nothing_again():
+    """For numba it has a type of its own."""
+
+    @compiled_inline
+    def added(x: float, count: int, first: bool) -> float:
+        return x + count if first else x - count
+
+    @compiled_inline
+    def caller(x: float, count: int, first: bool) -> float:
+        return added(added(x, 3, True), count, first)
+
+    called: Any = added
+    assert caller(0.5, 1, False) == 2.5
+    assert len(called.signatures) == 1

@@ -15,14 +15,8 @@ from magnetosuture_thread import ConfigurationError, cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_files import write_scene
-from magnetosuture_thread.settings.errors import BagError
-from magnetosuture_thread.settings.files import (
-    input_problem,
-    output_problem,
-    read_regular,
-    whole_file,
-    whole_folder,
-)
+from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
+from magnetosuture_thread.settings.files import input_problem, output_problem, read_regular, whole_file, whole_folder
 from test.bags.bags import STRING, read, texts, write_mcap, write_rosbag
 
 
@@ -144,6 +138,22 @@ def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):
         with pytest.raises(BagError, match="exists already"), whole_folder(output):
             pass
     assert (tmp_path / "out" / "mine").read_text() == "first"
+
+
+@pytest.mark.parametrize("stays", [True, False])
+def test_a_recording_stays_when_the_disk_is_full_and_nothing_else_does(tmp_path: Path, stays: bool):
+    output = tmp_path / "run"
+
+    def record() -> None:
+        with whole_folder(output, is_recording=stays) as folder:
+            (folder / "run_0.mcap").write_text("recorded")
+            raise RecordingEndedError(folder, "the disk is full", folder / "run_0.mcap")
+
+    with pytest.raises(BagError, match="the disk is full") as caught:
+        record()
+    assert list(tmp_path.rglob("*.mcap")) == [output / "run_0.mcap"] * stays
+    assert list(tmp_path.iterdir()) == [output] * stays
+    assert (str(output / "run_0.mcap") in str(caught.value)) == stays
 
 
 def test_an_interruption_leaves_nothing(tmp_path: Path):

@@ -100,9 +100,23 @@ def test_every_node_gets_the_same_file_and_namespace(description):
         assert node.name == (None if node.executable == "perception" else node.executable)
         assert node.parameters[0] == str(ROOT / "config" / "hernia_ring.yaml")
         assert node.namespace.name == "namespace"
-        assert node.parameters[1]["use_sim_time"].name == "use_sim_time"
+        assert node.parameters[1] == {"use_sim_time": False}
     bridges = {node.condition.kind: node.parameters[2:] for node in started if node.executable == "coil_bridge"}
     assert bridges == {"unless": [], "if": [{"driver": "simulated", "autostart": "armed"}]}
+
+
+@pytest.mark.parametrize("word", ["true", "True", "TRUE", "1", " true", "false", "False", "0"])
+def test_a_switch_is_what_conditions_of_launch_take(description, word: str):
+    started = nodes(description, planner=word, use_sim_time=word)
+    is_on = word.strip().lower() in ("true", "1")
+    assert ("needle_planner" in {node.executable for node in started}) == is_on
+    assert {node.parameters[1]["use_sim_time"] for node in started} == {is_on}
+
+
+@pytest.mark.parametrize("name", ["use_sim_time", "planner", "enclaves", "simulated", "console"])
+def test_another_word_for_a_switch_is_refused(description, name: str):
+    with pytest.raises(ValueError, match=f"{name}: got 'on', expected true or false"):
+        nodes(description, **{name: "on"})
 
 
 @pytest.mark.parametrize("planner", ["True", "false"])

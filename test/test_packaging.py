@@ -78,7 +78,7 @@ def test_every_import_has_a_key_of_rosdep_or_is_in_the_list_for_pip():
     by_pip = {re.split("[^a-z0-9]", word)[0] for word in shlex.split(line[1])}
     own = {"magnetosuture_thread", "typing_extensions"}  # the latter for mypy only
     cluster = {"dask", "distributed", "pyarrow", "upath"}
-    names = {"cv2": "opencv", "PIL": "pil", "rosbags": "rosbags-pip"}
+    names = {"cv2": "opencv", "PIL": "pil", "rosbags": "rosbags-pip", "simplejpeg": "simplejpeg-pip"}
     used = {name.split(".")[0] for path in MODULES for name in imported(path)} | {"lz4"}  # by import_module
     used -= {*sys.stdlib_module_names, *own, *cluster}
     missing = {name for name in used if not {name, f"python3-{names.get(name, name)}"} & keys}

@@ -39,7 +39,9 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     assert coils.needle_drag == pytest.approx(body.drag[0] + thread_drag, rel=0.05)
     field = rig.dynamics(setup.scene).field
     assert field is not None
-    assert np.linalg.norm(field.per_current(np.zeros(2))[:, 0]) == pytest.approx(coils.field_per_current, rel=0.01)
+    assert np.linalg.norm(field.at(np.zeros(2), np.eye(len(rig.coil_angles))[0])) == pytest.approx(
+        coils.field_per_current, rel=0.01
+    )
 
 
 def test_bridge_planner_and_forecast_keep_the_same_clearance():

@@ -1,5 +1,7 @@
 """Every code block of README and tutorials runs, in a folder of its own, in the order in which a reader meets it.
 
+So does each command `magnetosuture` that how-to pages and results show, of those that end by themselves.
+
 A comment before a block says what is special about it:
 
     <!-- file: NAME -->                     it is saved under that name
@@ -13,6 +15,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -21,6 +24,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
+from test.commands.test_calibrate_coils import probe
+from test.test_documentation import shell_lines
 
 pytestmark = pytest.mark.slow
 
@@ -129,3 +135,54 @@ def test_blocks_on_the_graph_run(page: Path, clone: Path):
             run(block, clone)
     if page.name in RESULTS:
         RESULTS[page.name](clone)
+
+
+SHOWN = [ROOT / "docs/results.md", ROOT / "docs/reproduction.md", *sorted((ROOT / "docs/how_to").glob("*.md"))]
+# Interactive, or on a robot, or elsewhere: tested by other means.
+NOT_HERE = re.compile(r"magnetosuture (coils|console|compile)|s3://|tcp://|BAG --output DIR$|--live|--bare|output/rig")
+LIVE = re.compile(r"simulate|replay (?!.*--offline)|thread-behavior")
+PLACES = {
+    **dict.fromkeys(("BAG", "FRAMES_OR_BAG", "RUNS"), "examples/post_wrap"),
+    **{
+        "D": "0.035",
+        "DIR": "made",
+        "NEW": "made",
+        "PROCEDURE": "dead_end",
+        "NAME": "dead_end",
+        "FOLDER_OR_VIDEO": "made",
+    },
+}
+
+NEEDLE_PX = {"--tail": ("505", "153"), "--tip": ("439", "97")}  # in the first frame of the example bag
+
+
+def commands() -> list[str]:
+    """Return the commands of the pages, each once."""
+    lines = [line for page in SHOWN for line in shell_lines(page)]
+    lines += [code for page in SHOWN for code in re.findall(r"`(magnetosuture [^`]* [^`]*)`", page.read_text())]
+    lines = [
+        line.partition("#")[0].strip().replace("BAG...", "BAG") for line in lines if line.startswith("magnetosuture ")
+    ]
+    return [line for line in dict.fromkeys(lines) if not NOT_HERE.search(line)]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [pytest.param(line, marks=[pytest.mark.whole_graph] * bool(LIVE.search(line))) for line in commands()],
+)
+def test_a_command_of_a_page_runs(line: str, clone: Path):
+    words = [PLACES.get(word, word) for word in shlex.split(line)]
+    if "FILE" in words:
+        words[words.index("FILE")] = "made.json" if "--table" in words else "made.yaml"
+    for end, place in NEEDLE_PX.items():
+        if words[1] == "teach":
+            words[words.index(end) + 1 : words.index(end) + 3] = place
+    if "--seeds" in words:
+        words[words.index("--seeds") + 1] = "1"
+    post = {"type": "Point", "coordinates": [0.005, 0.0]}
+    feature = {"type": "Feature", "geometry": post, "properties": {"name": "post", "radius": 0.002}}
+    scene = {"type": "FeatureCollection", "dish": {"diameter": 0.035}, "features": [feature]}
+    (clone / "lab.geojson").write_text(json.dumps(scene))
+    probe(clone)
+    run(Block("", "", "bash", shlex.join(words)), clone)
+    assert "--output" not in words or (clone / words[words.index("--output") + 1]).exists()

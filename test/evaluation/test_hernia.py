@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ def test_picture_and_animation_show_the_run(run: hernia.HerniaRun, tmp_path: Pat
     assert picture is not None
     for blue, green, red in ((84, 158, 31), (80, 166, 240)):  # a free thread, and one under friction, in BGR
         assert (np.abs(picture.astype(int) - (blue, green, red)).max(axis=2) < 40).sum() > 50
-    (tmp_path / "hernia.gif").write_bytes(hernia.draw_animation(replace(run, instants=run.instants[:100])))
+    (tmp_path / "hernia.gif").write_bytes(hernia.draw_animation(replace(run, instants=run.instants[:30])))
     frames = cv2.VideoCapture(str(tmp_path / "hernia.gif"))
     first, second = frames.read(), frames.read()
     assert first[0]
@@ -105,7 +106,9 @@ def test_no_node_is_ever_in_an_obstacle_and_no_segment_stretched(run: hernia.Her
     assert run.barriers.min() > -1e-6
 
 
-def test_the_job_leaves_figures_and_a_picture(tmp_path: Path):
+def test_the_job_leaves_figures_and_a_picture(run: hernia.HerniaRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its run is the one above."""
+    monkeypatch.setattr(hernia, "replay_steering", create_autospec(hernia.replay_steering, return_value=run))
     found = hernia.replay_hernia(STEERING, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["hernia.json", "hernia.png"]
     figures = json.loads((tmp_path / "out" / "hernia.json").read_text())

@@ -10,13 +10,21 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.evaluation.plots import draw_metrics
-from magnetosuture_thread.evaluation.reference import CaseResult, Evaluation, find_references, read_reference, score
+from magnetosuture_thread.evaluation.reference import (
+    CaseResult,
+    Evaluation,
+    find_references,
+    read_reference,
+    score,
+    score_rig,
+)
 from magnetosuture_thread.settings.errors import BagError
 
 MATERIAL = {
     "kind": "polyamide USP 7-0 monofilament",
     "L_m": 0.019,
     "EI_Nm2": 1.27e-9,
+    "EA_N": 5.0,
     "zeta_perp_Pa_s": 0.974,
     "zeta_par_Pa_s": 0.487,
     "diameter_m": 6e-5,
@@ -138,3 +146,20 @@ def test_the_depth_in_an_obstacle_is_seen(tmp_path: Path):
 def test_a_file_without_a_thread_is_refused(tmp_path: Path, changes: dict[str, Any], words: str):
     with pytest.raises(BagError, match=words):
         scored([write(tmp_path, "bad", **changes)])
+
+
+def test_the_rigs_thread_follows_one_that_is_pulled(tmp_path: Path):
+    kept, told, paths = list[str](), list[float](), [write(tmp_path, "pulled")]
+    evaluation = score_rig(paths, 19, told.append, lambda course: kept.append(course.reference.name))
+    case = evaluation.cases[0]
+    assert (evaluation.formulation, case.name, kept, case.fallbacks) == ("rig", "pulled", ["pulled"], 0)
+    assert case.max_error_percent < 1e-3
+    # Pulled by its own drag, half a segment less at the tail.
+    assert case.max_stretch == pytest.approx(0.487 * 0.0185 * 5e-3 / 5.0, rel=1e-3)
+    assert case.max_residual < 1e-6
+
+
+@pytest.mark.parametrize("changes", [{"boundary": "loose"}, {"material": {}}, {"material": {**MATERIAL, "EA_N": 0.0}}])
+def test_metadata_without_a_thread_of_the_rig_are_refused(tmp_path: Path, changes: dict[str, Any]):
+    with pytest.raises(BagError, match=r"bad\.npz: has"):
+        score_rig([write(tmp_path, "bad", **changes)])

@@ -64,7 +64,8 @@ def test_what_ends_the_call_ends_the_processes(work: Any):
 def test_processes_serve_again_and_an_error_of_this_package_is_raised_as_it_is(work: Any):
     with TaskRunner(work, 2) as runner:
         first, second = dict(runner.run([1, 2])), dict(runner.run([4, 5]))
-        assert {process for _, process, _ in second.values()} <= {process for _, process, _ in first.values()}
+        # One of both may have done all of the first tasks.
+        assert len({process for _, process, _ in (*first.values(), *second.values())}) <= 2
         with pytest.raises(BagError, match=r"^a\.mcap: is no mcap file$") as raised:
             list(runner.run([1, "raise"]))
     assert (raised.value.path, raised.value.problem) == ("a.mcap", "is no mcap file")
