@@ -11,7 +11,8 @@ from magnetosuture_msgs.msg import CoilBridgeState
 from magnetosuture_msgs.srv import GivePulse
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread.nodes import reading, topics
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.interface import Service
