@@ -41,6 +41,8 @@ MIN_SEEN = 0.7  # of a rod, that has to be in sight
 ROWS, TAPER = 0.4, 0.1  # widths between rows of samples; share of them at each end of which the middle alone counts
 BESIDE = (0.65, 1.1)  # widths from the axis to what is beside it
 CLOSING = 2.4  # widths, below which a dark thing is not taken for the floor
+LEAST_GAIN = 0.002  # of a score by climbing once more; noise of 2 grey levels over a rod makes as much
+FINEST_PX = 0.2  # step of an axis that a template refines
 UNKNOWN = 0  # darkness is 1 to 255 where it is known
 
 
@@ -65,8 +67,25 @@ class Candidate:
     filled: tuple[float, ...]
 
 
-def find_candidates(picture: Picture, size: NeedleSize) -> list[Candidate]:
-    """Return where a needle of a size may be in a picture, the best first."""
+@dataclass(frozen=True)
+class Prior:
+    """Where a needle must be, by what was seen before.
+
+    Attributes:
+        middle: of its axis, shape (2,) [px].
+        reach: how far from there it may be [px].
+        angle: of its axis there, in either direction [rad], from u towards v.
+        turn: by how much it may differ [rad].
+    """
+
+    middle: NDArray[np.float64]
+    reach: float
+    angle: float
+    turn: float
+
+
+def find_candidates(picture: Picture, size: NeedleSize, prior: Prior | None = None) -> list[Candidate]:
+    """Return where a needle of a size may be in a picture, the best first; all over it without a prior."""
     if size.length_px > math.hypot(*picture.shape):
         return []
     dark, taper = darkness(picture, size), 0.0 if size.is_blunt else TAPER
@@ -80,11 +99,10 @@ def find_candidates(picture: Picture, size: NeedleSize) -> list[Candidate]:
     bends = 2 * min(20, math.ceil(size.max_bend / (6.0 * width / length))) + 1
     best, which = np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.int32)
     seed = min(MAX_SEED, SEED / math.sqrt(max(size.max_bend, 1e-6))) * length  # whose sagitta is the same
-    _search_seeds(coarse, seed, width, angles, best, which)
-    reach = 2 * max(1, round(0.1 * length)) + 1
-    at = np.argwhere((best >= cv2.dilate(best, np.ones((reach, reach), np.uint8))) & (best > MIN_SEED))
+    region = _seed_region(coarse.shape, factor, prior, math.pi / angles)
+    _search_seeds(coarse, seed, width, angles, region, best, which)
     rough: list[tuple[float, np.ndarray, int]] = []
-    for row, column in at[np.argsort(-best[at[:, 0], at[:, 1]], kind="stable")[:MAX_SEEDS]]:
+    for row, column in _peaks(best, max(1, round(0.1 * length))):
         state = np.array([column, row, math.pi * which[row, column] / angles, 0.0])
         score = _bend(coarse, state, length, width, size.max_bend, bends, taper)
         scaled = [*((state[:2] + 0.5) * factor - 0.5), state[2], state[3] / factor]
@@ -104,6 +122,31 @@ def find_candidates(picture: Picture, size: NeedleSize) -> list[Candidate]:
             around, filled = _around_ends(dark, arc, size), _filled_ends(dark, arc, size)
             found.append(Candidate(arc, score, thing, tuple(ends), around, filled))
     return sorted(found, key=lambda candidate: -candidate.score)
+
+
+def _seed_region(shape: tuple[int, ...], factor: int, prior: Prior | None, step: float) -> tuple[float, ...]:
+    """Return u, v and reach [px] of the seeds in a picture reduced by a factor, their angle and its tolerance [rad]."""
+    if prior is None:
+        return 0.0, 0.0, math.hypot(*shape), 0.0, math.pi
+    u, v = ((value + 0.5) / factor - 0.5 for value in prior.middle)
+    return float(u), float(v), prior.reach / factor + 1.0, prior.angle, prior.turn + step
+
+
+def _peaks(best: NDArray[np.float32], reach: int) -> NDArray[np.int_]:
+    """Return row and column of the greatest scores within a reach [px], the best first, shape (n, 2).
+
+    Along a rod that is all dark many are equal: those that are as far from each other count, from its middle on.
+    """
+    side = 2 * reach + 1
+    top = ((best >= cv2.dilate(best, np.ones((side, side), np.uint8))) & (best > MIN_SEED)).astype(np.uint8)
+    _, labels, _, centres = cv2.connectedComponentsWithStats(top)
+    at = np.argwhere(top)
+    apart = np.hypot(*(at - centres[labels[at[:, 0], at[:, 1]]][:, ::-1]).T)
+    left, peaks = at[np.lexsort((apart, -best[at[:, 0], at[:, 1]]))], list[NDArray[np.int_]]()
+    while len(left) and len(peaks) < MAX_SEEDS:
+        peaks.append(left[0])
+        left = left[np.abs(left - left[0]).max(axis=1) > reach]
+    return np.array(peaks).reshape(-1, 2)
 
 
 def _around_ends(dark: NDArray[np.uint8], arc: Arc, size: NeedleSize) -> tuple[float, ...]:
@@ -133,10 +176,9 @@ def is_unique(candidates: list[Candidate], wall: Wall, size: NeedleSize) -> bool
     first, at = candidates[0], np.array([0.0, 0.5, 1.0]) * size.length_px
     places = first.arc.at(at)
     free = np.hypot(*(places[::2] - wall.centre).T) < wall.radius - 2.0 * size.width_px
-    if np.any(free & (np.array(first.around) > GOES_ON)):
+    if np.any(free & (np.maximum(first.around, first.ends) > GOES_ON)):
         return False
-    others = [each for each in candidates if math.dist(each.arc.at(at)[1], places[1]) > 0.5 * size.length_px]
-    return all(each.score < UNIQUE * first.score for each in others)
+    return all(each.score < UNIQUE * first.score for each in candidates[1:])
 
 
 def _is_same(state: np.ndarray, other: Candidate, size: NeedleSize) -> bool:
@@ -170,8 +212,9 @@ def darkness(picture: Picture, size: NeedleSize) -> NDArray[np.uint8]:
 
 
 @compiled
-def _search_seeds(dark, length, width, angles, best, which):
-    """Fill in the best score of straight rods around each dark pixel, and the number of its angle."""
+def _search_seeds(dark, length, width, angles, region, best, which):
+    """Fill in the best score of straight rods around each dark pixel of a region, and the number of its angle."""
+    centre_u, centre_v, reach, middle_angle, turn = region
     rows, columns = dark.shape
     count = max(3, int(length))
     step = length / count
@@ -180,8 +223,13 @@ def _search_seeds(dark, length, width, angles, best, which):
         for column in range(columns):
             if dark[row, column] < 96:  # by more than a third of what a needle is
                 continue
+            if math.hypot(column - centre_u, row - centre_v) > reach:
+                continue
             for index in range(angles):
                 angle = math.pi * index / angles
+                turned = (angle - middle_angle) % math.pi
+                if min(turned, math.pi - turned) > turn:
+                    continue
                 c, s = math.cos(angle), math.sin(angle)
                 inside, beside, known = 0.0, 0.0, 0
                 for place in range(count):
@@ -292,31 +340,34 @@ def _bend(dark, state, length, width, max_bend, bends, taper):
 def climb(dark, state, length, width, max_bend, taper):
     """Change (u, v, angle, curvature) to where the score is the greatest nearby; return it.
 
-    Steps are along and aside of the axis, of its angle and its curvature, halved where none of them is upwards.
+    Steps are along and aside of the axis, of its angle and its curvature, halved where none of them is upwards, and
+    begin anew while that gains more than `LEAST_GAIN`: what was too far before may not be any more.
     """
     best = _score(dark, state[0], state[1], state[2], state[3], length, width, taper)
-    step = width
-    trial = np.empty(4)
-    while step > 0.06:  # px
-        moved = False
-        for kind in range(4):
-            for way in range(-1, 2, 2):
-                trial[:] = state
-                c, s = math.cos(state[2]), math.sin(state[2])
-                if kind == 0:
-                    trial[0], trial[1] = state[0] + 2.0 * way * step * c, state[1] + 2.0 * way * step * s
-                elif kind == 1:
-                    trial[0], trial[1] = state[0] - way * step * s, state[1] + way * step * c
-                elif kind == 2:
-                    trial[2] = state[2] + way * step * 2.0 / length
-                else:
-                    bent = state[3] + way * step * 8.0 / (length * length)
-                    trial[3] = min(max(bent, -max_bend / length), max_bend / length)
-                score = _score(dark, trial[0], trial[1], trial[2], trial[3], length, width, taper)
-                if score > best:
-                    best = score
-                    state[:] = trial
-                    moved = True
-        if not moved:
-            step *= 0.5
+    trial, gain = np.empty(4), 1.0
+    while gain > LEAST_GAIN:
+        gain, step = -best, width
+        while step > FINEST_PX:
+            moved = False
+            for kind in range(4):
+                for way in range(-1, 2, 2):
+                    trial[:] = state
+                    c, s = math.cos(state[2]), math.sin(state[2])
+                    if kind == 0:
+                        trial[0], trial[1] = state[0] + 2.0 * way * step * c, state[1] + 2.0 * way * step * s
+                    elif kind == 1:
+                        trial[0], trial[1] = state[0] - way * step * s, state[1] + way * step * c
+                    elif kind == 2:
+                        trial[2] = state[2] + way * step * 2.0 / length
+                    else:
+                        bent = state[3] + way * step * 8.0 / (length * length)
+                        trial[3] = min(max(bent, -max_bend / length), max_bend / length)
+                    score = _score(dark, trial[0], trial[1], trial[2], trial[3], length, width, taper)
+                    if score > best:
+                        best = score
+                        state[:] = trial
+                        moved = True
+            if not moved:
+                step *= 0.5
+        gain += best
     return best

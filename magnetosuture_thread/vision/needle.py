@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize
-from magnetosuture_thread.vision.candidates import DARK_END, Candidate, find_candidates, is_unique
+from magnetosuture_thread.vision.candidates import DARK_END, Candidate, Prior, find_candidates, is_unique
 from magnetosuture_thread.vision.images import RIM_PX, Picture, SceneMask, median, middle
 from magnetosuture_thread.vision.template import (
     BESIDE_PX,
@@ -45,7 +45,7 @@ NO_SHAPE = "no needle's shape"
 
 
 def find_needles(
-    picture: Picture, size: NeedleSize, toward: np.ndarray | None = None
+    picture: Picture, size: NeedleSize, toward: np.ndarray | None = None, prior: Prior | None = None
 ) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find all that may be the needle.
 
@@ -54,12 +54,13 @@ def find_needles(
         size: of the needle in the picture.
         toward: where the needle must point, u right and v down; settles which end is which where both look
             alike, as when the tip is blurred.
+        prior: where its axis must be; None to search all over the picture.
 
     Returns:
         The needles, and in words why each of the other candidates is none.
     """
     fits: list[tuple[TemplateFit, SteelMap, int]] = []
-    candidates = find_candidates(picture, size)
+    candidates = find_candidates(picture, size, prior)
     for candidate in candidates:
         steel = _steel_at(picture, candidate.arc, size)
         fits += [(fit, steel, candidate.thing) for fit in _rough_fits(steel, candidate, size)]

@@ -20,7 +20,8 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_a
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.vision.arc import LengthEstimator, MeasuredNeedle
+from magnetosuture_thread.vision.arc import Arc, LengthEstimator, MeasuredNeedle
+from magnetosuture_thread.vision.candidates import Prior
 from magnetosuture_thread.vision.centreline import find_centreline, without_needle
 from magnetosuture_thread.vision.dish import DishWatch, FoundDish
 from magnetosuture_thread.vision.images import (
@@ -141,7 +142,10 @@ def _in_dish(needle: MeasuredNeedle, view: DishView) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Pose:
-    """A needle that was seen, in the dish frame; its direction is clear if it was in one frame of those so far."""
+    """A needle that was seen, in the dish frame; its direction is clear if it was in one frame of those so far.
+
+    In the image it turns by `bend` from its tail to its tip [rad], from u towards v.
+    """
 
     time: float
     tail: np.ndarray
@@ -149,6 +153,7 @@ class _Pose:
     velocity: np.ndarray
     turn_rate: float
     direction_is_clear: bool
+    bend: float
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
         """Return tail and heading angle predicted with constant velocity."""
@@ -375,7 +380,8 @@ class VisionTracker:
         for whole in (False, True) if last is not None else (True,):
             picture = self._picture(image, None if whole else self._region(image, view, time))
             toward = self._toward(view, time)
-            needles, refused = find_needles(picture, size, toward)
+            prior = None if whole else self._prior(picture.view, size.length_px, time)
+            needles, refused = find_needles(picture, size, toward, prior)
             needles = [self._proven(needle, picture) for needle in needles]
             if toward is None and (pointed := self._pointed_at(needles, picture, time)) is not None:
                 needles, _ = find_needles(picture, size, pointed.direction_px)
@@ -552,13 +558,26 @@ class VisionTracker:
             return False
         after = pose.time - last.time
         tail, angle = last.at(pose.time)
-        # 3 px and 6 degrees off the prediction, beside what the needle's greatest speed allows.
-        reach = self._settings.max_needle_speed * after + 3.0 * self._found_dish().view.metres_per_pixel
         turn = abs(_wrapped(pose.angle - angle))
-        return math.dist(pose.tail, tail) < reach and turn < min(self._most_turned(after), 0.5 * math.pi)
+        return math.dist(pose.tail, tail) < self._reach(after) and turn < min(self._most_turned(after), 0.5 * math.pi)
+
+    def _reach(self, after: float) -> float:
+        """Return how far a needle can have moved off the prediction after a time, with 3 px of error [m]."""
+        return self._settings.max_needle_speed * after + 3.0 * self._found_dish().view.metres_per_pixel
+
+    def _prior(self, view: DishView, length: float, time: float) -> Prior:
+        """Return where a needle of a length [px] that fits the last pose has its axis."""
+        assert self._last is not None
+        after = time - self._last.time
+        tail, angle = self._last.at(time)
+        ahead = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
+        axis = Arc(view.to_pixels(tail), math.atan2(ahead[1], ahead[0]), self._last.bend / length)
+        turn = self._most_turned(after)
+        reach = self._reach(after) / view.metres_per_pixel + 0.5 * length * min(turn, 1.0)
+        return Prior(axis.at(0.5 * length), reach, axis.angle + 0.5 * self._last.bend, turn)
 
     def _most_turned(self, after: float) -> float:
-        """Return by how much a needle can have turned off the prediction after a time [rad]."""
+        """Return by how much a needle can have turned off the prediction after a time, 6 degrees of error too [rad]."""
         return self._settings.max_turn_rate * after + math.radians(6.0)
 
     def _take(self, pose: _Pose, before: _Pose | None) -> None:
@@ -575,7 +594,7 @@ class VisionTracker:
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         direction_is_clear = pose.direction_is_clear or (before is not None and before.direction_is_clear)
         self._tip = None
-        self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate, direction_is_clear)
+        self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate, direction_is_clear, pose.bend)
         self._anew, self._is_pointed_at = [], False
 
     def _region(self, image: np.ndarray, view: DishView, time: float) -> tuple[int, int, int, int]:
@@ -606,8 +625,8 @@ def region(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[int, i
 
 def _pose(needle: MeasuredNeedle, picture: Picture, time: float) -> _Pose:
     heading = picture.view.directions_to_dish(needle.direction_px)
-    tail = picture.view.to_dish(needle.tail_edge_px)
-    return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0, needle.direction_is_clear)
+    tail, bend = picture.view.to_dish(needle.tail_edge_px), needle.arc.curvature * needle.length_px
+    return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0, needle.direction_is_clear, bend)
 
 
 def _wrapped(angle: float) -> float:
