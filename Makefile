@@ -1,6 +1,7 @@
 # make demo   play the example bag through the live graph
 # make test   run the tests, but for those that take long
-# make test-all  run all tests: browsers, tutorials, attacks and campaigns too
+# make test-slow  run those that take long: browsers, tutorials, attacks, campaigns
+# make test-all  run all tests; whole graphs that take long too, for which the machine must do nothing else
 # make kernels  compile what nodes would compile when they first start
 # make coverage  measure which lines of the core packages their tests run
 # make lint   check style and types
@@ -22,6 +23,8 @@ RUN := $(VENV)/bin
 DEMO := output/demo
 # Those with whole graphs among their tests: to collect all tests again would take longer than to start a graph.
 GRAPHS = $(shell grep --recursive --files-with-matches --word-regexp --include='test_*.py' whole_graph test)
+# Slow ones that start graphs or browsers: one after the other.
+ALONE := test/console/test_page.py test/test_site.py test/test_tutorials.py
 MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
 
 # What is imported is compiled then: the half of all modules. (pip takes this "no" for a yes.)
@@ -30,19 +33,26 @@ INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip 
 # Every node is a process that imports most of the packages: without their bytecode that takes it thrice as long.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all kernels coverage lint docs colcon peers clean help
+.PHONY: demo test test-slow test-all kernels coverage lint docs colcon peers clean help
 .PHONY: .packages .messages .kernels
 
 demo: $(INSTALLED)
 	@rm -rf $(DEMO)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
-test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph and not slow"
-	$(RUN)/python -m pytest -m "whole_graph and not slow" $(GRAPHS)
+TESTS := $(RUN)/python -m pytest
+BESIDE := --numprocesses=2 --dist=worksteal
 
-test-all: test
-	$(RUN)/python -m pytest -m slow test
+test: $(READY)
+	$(TESTS) $(BESIDE) -m "not whole_graph and not slow"
+	$(TESTS) -m "whole_graph and not slow" $(GRAPHS)
+
+test-slow: $(READY)
+	$(TESTS) $(BESIDE) -m "slow and not whole_graph" test $(addprefix --ignore=,$(ALONE))
+	$(TESTS) -m "slow and not whole_graph" $(ALONE)
+
+test-all: test test-slow
+	$(TESTS) -m "slow and whole_graph" $(GRAPHS)
 
 kernels: $(INSTALLED)
 	$(RUN)/magnetosuture compile

@@ -10,6 +10,8 @@ import pytest
 
 from test.examples import FOLDER
 
+pytestmark = pytest.mark.slow
+
 LINES = 40  # of an example at most
 SAYS = {
     "another_solver": "osqp and banded differ by 0.00 nm",

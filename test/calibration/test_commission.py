@@ -28,6 +28,8 @@ from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.rig.truth import with_rig
 from magnetosuture_thread.settings.errors import InvalidInputError
 
+pytestmark = pytest.mark.slow
+
 SETUP = "petri_35mm_polyamide"
 
 
@@ -306,7 +308,6 @@ def test_the_length_of_a_needle_is_measured_whatever_the_setup_says(believed: Se
         find_needle_length(empty, believed.vision, scene)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 7])
 def test_a_rig_is_measured_by_rendered_frames_and_the_tracker(seed: int, believed: Setup, tmp_path: Path):
     folder = tmp_path / "rig"

@@ -22,6 +22,8 @@ from magnetosuture_thread.evaluation.tables import TIMES
 from magnetosuture_thread.evaluation.workers import TaskRunner, Work, WorkerDiedError
 from magnetosuture_thread.settings.errors import ConfigurationError
 
+pytestmark = pytest.mark.slow
+
 SOURCE = """
 import os
 from pathlib import Path

@@ -70,7 +70,7 @@ async def steer_and_stop(page: Page, currents: Callable[[], list[CoilCurrents]])
     page.hold(1.0, 0.0, 0.005)
     await wait(page, lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
     assert abs(tail(page)[1] - before[1]) < 1e-3
-    assert page.graph["filter"]["commanded"] == [0.005, 0.0]
+    await wait(page, lambda: page.graph["filter"]["commanded"] == [0.005, 0.0], "the held velocity")
     assert await page.ask(type="pause", paused=True) == ""
     await wait(page, lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
     await wait(page, lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")

@@ -24,6 +24,8 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.nodes import wire
 from test.nodes.bridge import press
 
+pytestmark = pytest.mark.slow
+
 SPEED = 0.01  # m/s for one ampere in the first coil, to the right
 LEAST = np.array([0.1, 0.0, 0.0, 0.0])
 BRIDGE = {"driver": "simulated", "scene": "dish_35mm", "commissioning": True}

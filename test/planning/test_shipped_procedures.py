@@ -18,13 +18,14 @@ from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import share_directory
 from magnetosuture_thread.thread.prediction import NeedlePose
 
+pytestmark = pytest.mark.slow
+
 FOLDER = share_directory("magnetosuture_thread") / "config" / "procedures"
 SHIPPED = sorted(path.stem for path in FOLDER.glob("*.yaml"))
-LONG = ("figure_eight",)  # to plan, half a minute
 PERIOD = 0.05
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in SHIPPED])
+@pytest.mark.parametrize("name", SHIPPED)
 def test_an_ideal_needle_gets_to_the_end_by_certified_motions(name: str):
     procedure = read_procedure(name)
     setup = read_procedure_setup(procedure)

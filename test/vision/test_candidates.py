@@ -13,6 +13,8 @@ from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.test_rods import DIAMETER, Rod, is_along
 
+pytestmark = pytest.mark.slow
+
 SEEDS = range(16)
 
 

@@ -14,6 +14,8 @@ from magnetosuture_thread.vision.dish import Ellipse, find_rings, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import Pose, render
 
+pytestmark = pytest.mark.slow
+
 CLASSES = (
     "photo_on_cloth",
     "photo_on_light_box",

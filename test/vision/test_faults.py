@@ -12,6 +12,8 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import PIXEL, SCENE, Pose, blob, finger, random_pose, random_thread, render
 
+pytestmark = pytest.mark.slow
+
 TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 WHITE = (255.0, 255.0, 255.0)
 COLOURS = {

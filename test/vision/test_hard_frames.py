@@ -17,6 +17,8 @@ from magnetosuture_thread.geometry.thread_observation import PieceEnd
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, Track, VisionTracker
 
+pytestmark = pytest.mark.slow
+
 SCENE = Scene(dish=Dish(2.0 * DISH_RADIUS))
 SEED = 4711
 FRAMES = 6

@@ -6,6 +6,8 @@ import pytest
 
 from benchmarks.keep_out import Tally, attack
 
+pytestmark = pytest.mark.slow
+
 EPISODES = 80
 
 

@@ -18,6 +18,8 @@ from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, 
 from magnetosuture_thread.rig.campaign import RunResult, run_procedure, vary
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
 
+pytestmark = pytest.mark.slow
+
 SHORT = {"goals": [{"go_to": {"position": [0.008, -0.0145], "tolerance": 1e-3}}], "setup": "hernia_ring"}
 
 

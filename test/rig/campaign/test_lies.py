@@ -8,6 +8,8 @@ import pytest
 
 from benchmarks.lies import FAULTS, LIES, TIMES, run_lie
 
+pytestmark = pytest.mark.slow
+
 SEED = 3
 UNSEEN = ("drifts at 5 mm/s", "none")  # a drift of the camera is like a pull that is compensated
 ALIVE = ("goes in a circle", "walks at random")  # what moves may follow by chance for a while
