@@ -151,8 +151,8 @@ class MeasuredNeedle:
         return replace(self, covariance=covariance, confidence=confidence, heading_known=False, tail_shift_px=0.0)
 
     def pointing(self, toward: np.ndarray) -> MeasuredNeedle:
-        """Return the needle the way round that a direction is nearer to, shape (2,)."""
-        return self if self.arc.direction(0.5 * self.length_px) @ toward > 0.0 else self.reversed()
+        """Return the needle the way round that its middle points in a direction, shape (2,)."""
+        return self if self.middle_direction_px @ toward > 0.0 else self.reversed()
 
     @property
     def tail_px(self) -> np.ndarray:
@@ -173,6 +173,11 @@ class MeasuredNeedle:
     def direction_px(self) -> np.ndarray:
         """Unit tangent at the tail, u right and v down, shape (2,)."""
         return self.arc.direction(self.tail_shift_px)
+
+    @property
+    def middle_direction_px(self) -> np.ndarray:
+        """Unit tangent at the middle, u right and v down, shape (2,)."""
+        return self.arc.direction(0.5 * self.length_px)
 
     @property
     def curvature_px(self) -> float:

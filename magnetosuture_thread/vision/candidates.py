@@ -42,7 +42,7 @@ ROWS, TAPER = 0.4, 0.1  # widths between rows of samples; share of them at each 
 BESIDE = (0.65, 1.1)  # widths from the axis to what is beside it
 CLOSING = 2.4  # widths, below which a dark thing is not taken for the floor
 LEAST_GAIN = 0.002  # of a score by climbing once more; noise of 2 grey levels over a rod makes as much
-FINEST_PX = 0.2  # step of an axis that a template refines
+FINEST_PX = 0.2  # step of a climb; noise moves its end by more
 UNKNOWN = 0  # darkness is 1 to 255 where it is known
 
 
@@ -167,7 +167,7 @@ def _filled_ends(dark: NDArray[np.uint8], arc: Arc, size: NeedleSize) -> tuple[f
 
 
 def is_unique(candidates: list[Candidate], wall: Wall, size: NeedleSize) -> bool:
-    """Say whether the first is a needle by its score alone: a rod up to both of its ends, and no other is as good.
+    """Say whether the first of those found is a needle by its score alone: a rod up to both ends, and no other as good.
 
     At the wall it may be dark beyond an end.
     """
@@ -340,8 +340,8 @@ def _bend(dark, state, length, width, max_bend, bends, taper):
 def climb(dark, state, length, width, max_bend, taper):
     """Change (u, v, angle, curvature) to where the score is the greatest nearby; return it.
 
-    Steps are along and aside of the axis, of its angle and its curvature, halved where none of them is upwards, and
-    begin anew while that gains more than `LEAST_GAIN`: what was too far before may not be any more.
+    Steps are along the bent axis and aside of it, of its angle and its curvature, halved where none of them is upwards,
+    and begin anew while that gains more than `LEAST_GAIN`: what was too far before may not be any more.
     """
     best = _score(dark, state[0], state[1], state[2], state[3], length, width, taper)
     trial, gain = np.empty(4), 1.0
@@ -354,7 +354,10 @@ def climb(dark, state, length, width, max_bend, taper):
                     trial[:] = state
                     c, s = math.cos(state[2]), math.sin(state[2])
                     if kind == 0:
-                        trial[0], trial[1] = state[0] + 2.0 * way * step * c, state[1] + 2.0 * way * step * s
+                        turned = way * step * state[3]  # of the chord by which it slides; the tangent by twice that
+                        trial[0] = state[0] + 2.0 * way * step * math.cos(state[2] + turned)
+                        trial[1] = state[1] + 2.0 * way * step * math.sin(state[2] + turned)
+                        trial[2] = state[2] + 2.0 * turned
                     elif kind == 1:
                         trial[0], trial[1] = state[0] - way * step * s, state[1] + way * step * c
                     elif kind == 2:

@@ -52,7 +52,7 @@ def find_needles(
     Args:
         picture: the frame or a part of it.
         size: of the needle in the picture.
-        toward: where the needle must point, u right and v down; settles which end is which where both look
+        toward: where the needle's middle must point, u right and v down; settles which end is which where both look
             alike, as when the tip is blurred.
         prior: where its axis must be; None to search all over the picture.
 
@@ -166,7 +166,7 @@ def measure_needle(
         steel: the image around it.
         rough: to it.
         size: of the needle.
-        toward: where it must point, u right and v down; see `find_needles`.
+        toward: where its middle must point, u right and v down; see `find_needles`.
 
     Returns:
         The needle, in the picture's pixels, or in words why there is none.
@@ -349,7 +349,7 @@ def _settled(
     A thread leaves a rod's tail through its middle, and does not lie over the rod there. One that passes beside one end
     of a pointed needle hides the shape of that end; the other is the tail if it is blunt and no thread goes on there.
     """
-    if toward is not None and abs(float(fit.arc.direction() @ toward)) > 0.8:
+    if toward is not None and abs(float(fit.arc.direction(0.5 * fit.length) @ toward)) > 0.8:
         return _pointing(fit, toward), True, False
     offsets = _thread_offsets(steel, rod)
     if not is_rod and offsets == (None, None) and rod.cost < fit.cost:

@@ -384,7 +384,7 @@ class VisionTracker:
             needles, refused = find_needles(picture, size, toward, prior)
             needles = [self._proven(needle, picture) for needle in needles]
             if toward is None and (pointed := self._pointed_at(needles, picture, time)) is not None:
-                needles, _ = find_needles(picture, size, pointed.direction_px)
+                needles, _ = find_needles(picture, size, pointed.middle_direction_px)
                 needles = [each for each in needles if math.dist(each.tip_px, pointed.tip_px) < 0.5 * each.length_px]
             elif toward is not None and whole and not self._near_before(needles, picture, time):
                 needles, refused = find_needles(picture, size, None)  # it is elsewhere, and may have turned round
@@ -392,7 +392,8 @@ class VisionTracker:
             needles = [self._as_before(needle, picture, time) for needle in needles]
             within = [needle for needle in needles if self._fits(_pose(needle, picture, time), last)]
             if len(within) == 1 and not (whole and not within[0].heading_known):
-                self._take(_pose(within[0], picture, time), last)
+                if within[0].heading_known or toward is not None:  # else its ends are in any order
+                    self._take(_pose(within[0], picture, time), last)
                 return within[0], picture, whole, ""
         if not needles:
             self._anew = []
@@ -440,13 +441,13 @@ class VisionTracker:
         return any(self._fits(_pose(needle, picture, time), self._before) for needle in needles)
 
     def _toward(self, view: DishView, time: float) -> Points | None:
-        """Return where the needle must point, u right and v down; None where it may have turned round unseen."""
+        """Return where the needle's middle must point, u right and v down; None where it may have turned unseen."""
         before = self._before
         if before is None or self._most_turned(time - before.time) > 0.5 * math.pi:
             return None
         if self._last is None and not self._is_pointed_at:  # Each frame that confirms a direction must tell it itself.
             return None
-        _, angle = before.at(time)
+        angle = before.at(time)[1] - 0.5 * before.bend  # of the middle; the dish's y goes up
         return view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
 
     def _pointed_at(self, needles: list[MeasuredNeedle], picture: Picture, time: float) -> MeasuredNeedle | None:
@@ -573,7 +574,7 @@ class VisionTracker:
         ahead = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
         axis = Arc(view.to_pixels(tail), math.atan2(ahead[1], ahead[0]), self._last.bend / length)
         turn = self._most_turned(after)
-        reach = self._reach(after) / view.metres_per_pixel + 0.5 * length * min(turn, 1.0)
+        reach = self._reach(after) / view.metres_per_pixel + length * math.sin(0.5 * min(turn, 0.5 * math.pi))
         return Prior(axis.at(0.5 * length), reach, axis.angle + 0.5 * self._last.bend, turn)
 
     def _most_turned(self, after: float) -> float:

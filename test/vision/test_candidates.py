@@ -34,15 +34,16 @@ def dimpled(image: np.ndarray, seed: int, rod: np.ndarray | None = None) -> np.n
     return np.clip(result, 0.0, 255.0).astype(np.uint8)
 
 
-def test_the_axis_is_found_among_dimples_and_beside_a_bump_that_hides_a_part():
+@pytest.mark.parametrize(("bend", "share"), [(0.0, 0.06), (0.4, 0.1), (-0.8, 0.1), (1.5, 0.1)])
+def test_the_axis_is_found_among_dimples_and_beside_a_bump_that_hides_a_part(bend: float, share: float):
     found = 0
     for seed in SEEDS:
-        image, ends, told = Rod(seed, share=0.03).drawn()
+        image, ends, told = Rod(seed, share=0.03, bend=bend).drawn()
         seen = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(dimpled(image, seed, ends))
         assert seen.state is not State.TRACKED
         if len(seen.axis):
             found += 1
-            assert is_along(seen, ends) or is_along(seen, ends[::-1])
+            assert is_along(seen, ends, share) or is_along(seen, ends[::-1], share)
     assert found >= 14
 
 
