@@ -19,7 +19,7 @@ resolution. Beyond the wall and in shapes a needle may go on, and nothing is bes
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -40,6 +40,7 @@ MAX_SEEDS, MAX_CANDIDATES = 96, 8
 MIN_SEEN = 0.7  # of a rod, that has to be in sight
 ROWS, TAPER = 0.4, 0.1  # widths between rows of samples; share of them at each end of which the middle alone counts
 BESIDE = (0.65, 1.1)  # widths from the axis to what is beside it
+BORDER = 4.0  # widths beyond a needle, as far as its floor and its ends are looked at
 CLOSING = 2.4  # widths, below which a dark thing is not taken for the floor
 LEAST_GAIN = 0.002  # of a score by climbing once more; noise of 2 grey levels over a rod makes as much
 FINEST_PX = 0.2  # step of a climb; noise moves its end by more
@@ -86,6 +87,27 @@ class Prior:
 
 def find_candidates(picture: Picture, size: NeedleSize, prior: Prior | None = None) -> list[Candidate]:
     """Return where a needle of a size may be in a picture, the best first; all over it without a prior."""
+    if prior is not None:
+        away = prior.reach + 0.5 * size.length_px + BORDER * size.width_px
+        picture, offset = _part(picture, prior.middle - away, prior.middle + away)
+        found = _search(picture, size, replace(prior, middle=prior.middle - offset))
+        return [replace(each, arc=each.arc.shifted(offset)) for each in found]
+    return _search(picture, size, None)
+
+
+def _part(picture: Picture, low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Picture, NDArray[np.int_]]:
+    """Return what the search needs of a picture between two corners (u, v) [px], and where it begins in it."""
+    columns, rows = (np.array([low, high + 1.0]).T.clip(0, np.array(picture.shape[::-1])[:, None])).astype(int)
+    box, offset = (slice(*rows), slice(*columns)), np.array([columns[0], rows[0]])
+    layer, (u, v), mask = picture.brightest, picture.wall.centre, picture.mask
+    brightest = replace(layer, pixels=layer.pixels[box], floor=layer.floor[box])
+    wall = replace(picture.wall, centre=(u - float(offset[0]), v - float(offset[1])))
+    mask = None if mask is None else replace(mask, depth=mask.depth[box])
+    return replace(picture, brightest=brightest, wall=wall, mask=mask), offset
+
+
+def _search(picture: Picture, size: NeedleSize, prior: Prior | None) -> list[Candidate]:
+    """Return the candidates of a picture."""
     if size.length_px > math.hypot(*picture.shape):
         return []
     dark, taper = darkness(picture, size), 0.0 if size.is_blunt else TAPER
