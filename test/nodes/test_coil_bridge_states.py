@@ -241,9 +241,14 @@ def test_a_bridge_that_commissions_gives_pulses_and_follows_no_command(graph):
 
 def test_a_stop_ends_a_pulse_at_once(graph):
     node = armed(graph, commissioning=True, **LONG)
+    messages = graph.listen(topics.CURRENTS)
     pulsed(graph, node)
     assert press(graph, Service.EMERGENCY_STOP).success
+    answered = reading.nanoseconds(graph.now())
     assert not applied(node)[-1].any()
+    graph.wait(lambda: bool(messages) and "emergency stop" in messages[-1].stop, "the reason")
+    flowing = [reading.nanoseconds(message.header.stamp) for message in messages if any(message.current)]
+    assert flowing[-1] < answered
     count = sum(currents.any() for currents in applied(node))
     assert "emergency stop" in pulse(graph).message
     assert sum(currents.any() for currents in applied(node)) == count
