@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,18 +28,13 @@ MIN_ALIGNING_SHARE, CONSTRAINT_WEIGHT = 0.4, 100.0
 CURRENT_WEIGHT = 1e-3
 
 HEADING_ERROR = 0.006  # rad; of a needle's measured pose
-# That error grows exponentially with the pose's age, at this rate [1/s] and up to this bound [rad]. In a crossing of a
-# coil's axis large currents against a pull are an unstable balance: a needle beside its place turns with the field
-# there, and is thrown farther.
-ERROR_GROWTH, MAX_HEADING_ERROR = 30.0, 0.2
-HEADING_STEP = 0.01  # rad; for the derivative by the heading
+HEADING_STEP, PLACE_STEP = 0.01, 1e-4  # rad and m; for the derivatives by heading and place
 COIL_ERROR = 0.015  # of a coil's field, with its gain estimated: in some seconds, by a needle that is driven
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 FIELD_ROUNDS, FIELD_TOLERANCE = 6, 0.03  # solutions, until the field along the needle is known to this share
 LEAST_FIELD = 1e-6  # T; in a weaker one the needle is turned by its torque alone
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
-DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and of its shape against a straight one
 BISECTIONS = 7  # of the certified share: to 1 %, and never beyond it
 
 
@@ -108,6 +104,21 @@ class Allocation:
     drift: float = 0.0
 
 
+class PoseDeviation(NamedTuple):
+    """Standard deviations of a needle's measured pose.
+
+    Attributes:
+        place: in each direction, until a next pose can be answered [m].
+        stamp: of its time [s].
+    """
+
+    place: float = 0.0
+    stamp: float = 0.0
+
+
+EXACT = PoseDeviation()
+
+
 class CoilAllocation:
     """Allocates coil currents for a velocity of the needle's tip.
 
@@ -127,11 +138,12 @@ class CoilAllocation:
     What errors of the coils (`COIL_ERROR`) and of the heading would do to drift and direction counts too. The deviation
     of the heading is
 
-        hypot(min(`HEADING_ERROR` exp(`ERROR_GROWTH` age), `MAX_HEADING_ERROR`), `COIL_ERROR` |a| / (B . e))
+        |(`HEADING_ERROR`, omega s_t, s |dB/dn . n| / (B . e), `COIL_ERROR` |a| / (B . e))|
 
-    with the field a of each coil across the needle: close to a coil's axis large fields cancel each other there, and a
-    needle against a pull is in an unstable balance. B . e and a are those of the solution before, from that of the last
-    currents on.
+    with the turn rate omega, the deviations s_t of the time of its pose and s of its place, and the field a of each
+    coil across it. A needle beside its place turns with the field there. Close to a coil's axis, where large fields
+    cancel each other, one that is held against a pull is therefore in an unstable balance: the later its poses are, the
+    less of the pull is held. These fields are those of the solution before, from that of the last currents on.
 
     Source: none.
 
@@ -170,15 +182,16 @@ class CoilAllocation:
         return self._period * field / -math.expm1(-self._period * field / slow) if self._period else slow
 
     @staticmethod
-    def _doubt(measured: float, across: Vector, field: float) -> float:
+    def _doubt(measured: float, bent: float, across: Vector, field: float) -> float:
         """Return the deviation of the heading [rad].
 
         Args:
-            measured: of the measured heading [rad].
+            measured: of the measured heading, carried to now [rad].
+            bent: deviation of the field across the needle by that of its place [T].
             across: field of each coil across the needle, shape (m,) [T], with an error of `COIL_ERROR`.
             field: along it [T].
         """
-        return math.hypot(measured, COIL_ERROR * float(np.linalg.norm(across)) / field)
+        return math.hypot(measured, bent / field, COIL_ERROR * float(np.linalg.norm(across)) / field)
 
     def slack_speed(self, allocation: Allocation, heading: Vector) -> float:
         """Return the speed that the force of allocated currents gives a needle that lies along it, with a slack thread.
@@ -206,7 +219,7 @@ class CoilAllocation:
         heading: Vector,
         previous: Vector | None = None,
         max_change: float = math.inf,
-        age: float = 0.0,
+        deviation: PoseDeviation = EXACT,
         *,
         balance: float = 0.0,
         at_tip: bool = False,
@@ -219,7 +232,7 @@ class CoilAllocation:
             heading: unit vector along the needle at its tail, shape (2,).
             previous: currents of the last step, shape (m,) [A]; no limit on change if None.
             max_change: maximum change of each current [A].
-            age: time since the pose was measured [s].
+            deviation: of the needle's pose.
             balance: b, to the needle's left [T].
             at_tip: whether the tip is to move as it would by that motion: then the needle turns against what the
                 currents add across it, and errors do not count. Else it turns as commanded.
@@ -237,8 +250,9 @@ class CoilAllocation:
         swung = lever / CORRECTION_TIME * across_field / (MIN_ALIGNING_SHARE * self._field)
         effort = np.hypot(CURRENT_WEIGHT / self._max_current, COIL_ERROR / across_speed * np.hypot(across, swung))
         # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
-        growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
-        measured, beside = HEADING_ERROR * math.exp(growth), math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
+        beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
+        measured = math.hypot(HEADING_ERROR, twist.turn_rate * deviation.stamp)
+        bend = deviation.place / PLACE_STEP * (self._rows(middle + PLACE_STEP * n, e)[2] - across_field)
         misaligned = (self._rows(middle, beside)[1] - across) / (HEADING_STEP * across_speed)
         if at_tip:  # a drift by such an error is corrected by the turn, as any other
             effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
@@ -262,7 +276,7 @@ class CoilAllocation:
         doubt = measured
         if previous is not None and previous.any():  # from which what is looked for is not far
             field = max(float(along_field @ previous), least)
-            doubt = self._doubt(measured, across_field * previous, field)
+            doubt = self._doubt(measured, float(bend @ previous), across_field * previous, field)
         for _ in range(FIELD_ROUNDS):
             system[4] = doubt * misaligned
             response = self._response(field)
@@ -280,7 +294,8 @@ class CoilAllocation:
                 target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
                 currents = self._bounded_least_squares(system, target, lower, upper)
             before, field = field, max(float(along_field @ currents), least)
-            last, doubt = doubt, math.sqrt(doubt * self._doubt(measured, across_field * currents, field))
+            last, now = doubt, self._doubt(measured, float(bend @ currents), across_field * currents, field)
+            doubt = math.sqrt(last * now)
             if max(abs(field - before) / before, abs(doubt - last) / last) <= FIELD_TOLERANCE:
                 break
         found = self.motion(currents, tail, heading, balance)
@@ -318,9 +333,9 @@ class CoilAllocation:
         with the row w of that velocity, and P the projection onto the rows of the other three. An axis is where A falls
         to less than half of what it is elsewhere: four coils have two, six have none. The error `COIL_ERROR` of a
         current I turns the field, of strength B_0 and b for one ampere, and with it the needle. Currents that turn it
-        by no more than `DIRECTION_DEVIATION` hold it against
+        by no more than `HEADING_ERROR` hold it against
 
-            dA / dtheta I,    I = min(DIRECTION_DEVIATION B_0 / (COIL_ERROR b), max_current)
+            dA / dtheta I,    I = min(HEADING_ERROR B_0 / (COIL_ERROR b), max_current)
 
         for each radian off an axis.
 
@@ -334,7 +349,7 @@ class CoilAllocation:
             return float(np.linalg.norm(rows[1] - kept @ (kept.T @ rows[1])))
 
         field = float(np.linalg.norm(self._rows(np.zeros(2), np.array([1.0, 0.0]))[2:], axis=0).max())
-        current = min(DIRECTION_DEVIATION * self._field / (COIL_ERROR * field), self._max_current)
+        current = min(HEADING_ERROR * self._field / (COIL_ERROR * field), self._max_current)
         found, axes = np.array([authority(angle) for angle in np.radians(np.arange(180.0))]), []
         minima = (found < np.roll(found, 1)) & (found <= np.roll(found, -1)) & (found < 0.5 * found.max())
         for angle in np.radians(np.flatnonzero(minima)).tolist():
@@ -385,6 +400,7 @@ class CertifiedAllocation:
         max_change: float,
         pull: NeedleTwist | None,
         balance: float = 0.0,
+        deviation: PoseDeviation = EXACT,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.
 
@@ -396,6 +412,7 @@ class CertifiedAllocation:
             max_change: maximum change of each current [A].
             pull: motion that something else gives the needle; None where that is not measured.
             balance: of the torque that something else gives it, see `CoilAllocation` [T].
+            deviation: of its pose.
         """
         at = pose.tail, pose.heading
 
@@ -405,7 +422,7 @@ class CertifiedAllocation:
         def allocated(wanted: NeedleTwist) -> tuple[Allocation, str]:
             against = wanted if pull is None else wanted.less(pull)
             allocation = self._coils.allocate(
-                against, *at, previous.currents, max_change, pose.age, balance=balance, at_tip=pull is None
+                against, *at, previous.currents, max_change, deviation, balance=balance, at_tip=pull is None
             )
             speed, limit = self._coils.slack_speed(allocation, pose.heading), self._max_speed
             if pull is not None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation
+from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation, PoseDeviation
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.filter import FRICTION, SPEED, NeedleSafetyFilter, rest_reason
 from magnetosuture_thread.coils.inputs import (
@@ -382,8 +382,9 @@ class CoilBridge:
             twist = twist._replace(turn_rate=min(rate, max(-rate, twist.turn_rate)))
         max_change = settings.max_current_slew * elapsed
         balance = 0.0 if pull is None else self._heading.balance(pull.across)
+        doubt = PoseDeviation(self._observer.place_deviation(now), self._heading.stamp_deviation)
         allocation, limiting = self._coils.allocate(
-            twist, pose, self._filter, self._previous, max_change, pull, balance
+            twist, pose, self._filter, self._previous, max_change, pull, balance, doubt
         )
         limits = limiting, CURRENT_LIMIT if allocation.saturated else ""
         active += tuple(name for name in limits if name and name not in active)

@@ -73,6 +73,7 @@ class MotionObserver:
         self._place, self._velocity, self._covariance = np.zeros(2), np.zeros(2), np.zeros((2, 2))
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
         self._seen: tuple[float, Vector] | None = None  # the last pose that counted
+        self._interval = 0.0  # between poses [s]
         self._innovation = math.nan  # of the last pose, squared over its variance
         self._applied: deque[tuple[float, Vector]] = deque()  # what the currents were set for, each with its start
 
@@ -85,6 +86,16 @@ class MotionObserver:
         """Return d as the motion of a needle with a heading, a unit vector at its tail of shape (2,)."""
         (ex, ey), (x, y) = self._needle.chord_direction(heading), self._velocity
         return NeedleTwist(float(ex * x + ey * y), float(ex * y - ey * x), 0.0)
+
+    def place_deviation(self, now: float) -> float:
+        """Return the standard deviation of the place, in each direction, until a next pose can be answered [m].
+
+        That is an interval of poses from now: 0 before the first pose.
+        """
+        if self._seen is None:
+            return 0.0
+        interval = min(MAX_GAP, max(0.0, now - self._seen[0]) + self._interval)
+        return math.sqrt(self._grown(interval)[0, 0])
 
     def update(
         self, tail: Vector, heading: Vector, stamp: float, trusted: bool = False, stamp_deviation: float = 0.0
@@ -105,6 +116,7 @@ class MotionObserver:
             self._velocity, self._seen = np.zeros(2), None
         self._learn(stamp, middle, trusted, stamp_deviation)
         interval = 0.0 if last is None else stamp - last[0]
+        self._interval = interval if 0.0 < interval <= MAX_GAP else self._interval
         applied = self._mean_applied(stamp - interval, stamp) if 0.0 < interval <= MAX_GAP else None
         if last is None or applied is None:
             return None
@@ -144,9 +156,13 @@ class MotionObserver:
 
     def _predicted(self, interval: float, applied: Vector) -> tuple[Vector, Vector]:
         """Return place [m] and covariance after an interval [s] with a velocity by the currents, shape (2,) [m/s]."""
+        return self._place + interval * (applied + self._velocity), self._grown(interval)
+
+    def _grown(self, interval: float) -> Vector:
+        """Return the covariance of place and velocity after an interval [s], shape (2, 2)."""
         step = np.array([[1.0, interval], [0.0, 1.0]])
         noise = PULL_NOISE * np.array([[interval**3 / 3.0, interval**2 / 2.0], [interval**2 / 2.0, interval]])
-        return self._place + interval * (applied + self._velocity), step @ self._covariance @ step.T + noise
+        return np.asarray(step @ self._covariance @ step.T + noise)
 
     def apply(self, now: float, applied: Vector, intended: Vector, turn_rate: float) -> None:
         """Register what currents are set for from a time on.

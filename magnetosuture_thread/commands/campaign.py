@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -23,7 +23,7 @@ from magnetosuture_thread.evaluation.tables import write_table
 from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.rig import campaign as run
-from magnetosuture_thread.rig.closed_loop import RunBag
+from magnetosuture_thread.rig.closed_loop import LATENCY, RunBag
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup
 from magnetosuture_thread.rig.truth import with_rig
 from magnetosuture_thread.settings.errors import BagError, shortened
@@ -45,6 +45,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--first-seed", type=first, default=0, metavar="K", help="seed of the first run (default: 0)")
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
     command.add_rig(parser)
+    latency = f"from a frame to the command that follows from it [s] (default: {LATENCY:g})"
+    option("--latency", type=command.number_argument(0.0, 1.0), default=LATENCY, metavar="S", help=latency)
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
     bags = "seeds whose runs are recorded as bags (default: none)"
     option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
@@ -72,8 +74,9 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
     setup = with_rig(read_procedure_setup(procedure, options.setup), options.rig)
     run.check_run(procedure, setup, run.vary(setup, seeds[0]))
-    result = CampaignResult(procedure, setup, options.camera)
-    work = partial(_run, procedure, setup, setup.path.read_text(encoding="utf-8"), options.camera)
+    result = CampaignResult(procedure, setup, options.camera, options.latency)
+    about = setup.path.read_text(encoding="utf-8"), options.camera, options.latency
+    work = partial(_run, procedure, setup, *about)
     with (
         terminal.progress("campaign") as advance,
         whole_folder(options.output) as folder,
@@ -116,6 +119,7 @@ class CampaignResult:
         procedure: that was run.
         setup: what the nodes believe.
         camera: whether frames were rendered and tracked.
+        latency: from a frame to the command that followed from it [s].
         runs: in the order of their seeds.
         died: seeds whose process ended early, and why.
     """
@@ -123,6 +127,7 @@ class CampaignResult:
     procedure: Procedure
     setup: Setup
     camera: bool
+    latency: float
     runs: list[run.RunResult] = field(default_factory=list)
     died: dict[int, str] = field(default_factory=dict)
 
@@ -143,6 +148,7 @@ class CampaignResult:
             "procedure": self.procedure.name,
             "setup": self.setup.name,
             "camera": self.camera,
+            "latency_s": self.latency,
             "simulated": True,
             "successes": self.successes,
             "runs": [outcome.to_json() for outcome in self.runs],
@@ -154,7 +160,14 @@ Task = tuple[int, Path | None]  # seed, and folder of the bag if any
 
 
 def _run(
-    procedure: Procedure, setup: Setup, text: str, camera: bool, task: Task, log: Log, progress: Progress
+    procedure: Procedure,
+    setup: Setup,
+    text: str,
+    camera: bool,
+    latency: float,
+    task: Task,
+    log: Log,
+    progress: Progress,
 ) -> tuple[run.RunResult, float]:
     """Run one seed, with the folder of its bag if any; return what came of it, and its processor time [s]."""
     began, (seed, folder) = process_time(), task
@@ -165,7 +178,8 @@ def _run(
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
         recorder = None if bag is None else RunBag(bag, setup, camera=camera)
-        result = run.run_procedure(procedure, setup, run.vary(setup, seed), camera=camera, recorder=recorder)
+        variation = replace(run.vary(setup, seed), latency=latency)
+        result = run.run_procedure(procedure, setup, variation, camera=camera, recorder=recorder)
     return result, process_time() - began
 
 

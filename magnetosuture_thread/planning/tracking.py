@@ -67,10 +67,10 @@ class TrackingCommand:
 class PathTracker:
     """Tracks a path of poses by the middle of the needle's chord, ahead and back.
 
-    With the planned pose (p_r, theta_r) at the setpoint, its velocity u_r along the chord, its turn rate omega_r, and
-    the unit vector e along the needle, the motion that is commanded is
+    With the planned pose (p_r, theta_r) at the setpoint, its velocity u_r along the chord and its turn rate omega_r,
+    the motion that is commanded is
 
-        v = u_r e + k (p_r + b - p),    omega = omega_r + k_theta (theta_r + delta - theta)
+        v = u_r (cos, sin)(theta_r + delta) + k (p_r + b - p),    omega = omega_r + k_theta (theta_r + delta - theta)
 
     The place is corrected by force, along and across the needle, with k = min(`delayed_gain`, `MAX_PLACE_GAIN`).
     The setpoint's speed has a trapezoidal profile between the places where the needle changes between ahead and back.
@@ -84,9 +84,10 @@ class PathTracker:
         max(min(|d_a| / a, `MAX_ANGLE`), min(|d| / a, `MAX_AXIS_ANGLE`))
 
     with the velocity a that the coils hold for each radian, on the side of theta_r, and jumps to the other side when
-    theta_r crosses. A thread that holds the tail displaces the middle in that turn: before it the place is b, half of
-    that to the side that the needle comes from. All of theta - theta_r stays within what half of the path's leeway
-    allows. Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
+    theta_r crosses. The way is still along theta_r + delta, not along the needle. A thread that holds the tail
+    displaces the middle in that turn: before it the place is b, half of that to the side that the needle comes from.
+    All of theta - theta_r stays within what half of the path's leeway allows. Corrections of the direction are raised
+    by as much as the bridge slows them, within the same limits.
 
     Source: line-of-sight guidance of ships, Fossen 2011, section 10.3; for the place, proportional control of a
     fully actuated one. Deviation: the weight of the two, by what force is left.
@@ -157,6 +158,7 @@ class PathTracker:
         gain = min(MAX_PLACE_GAIN, delayed_gain(age, interval))
         steered = self._steered(angle, abs(float(pull @ n)) + gain * abs(across))
         course = min(allowed, max(-allowed, steered * driven * sense * math.atan(across / LOOKAHEAD)))
+        aside = turn + course  # of the way, to the left of the needle [rad]
         off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, pull)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
@@ -171,8 +173,8 @@ class PathTracker:
             self._stops.pop(0)
         turn += course
         limit = MAX_ALONG_RATIO * speed
-        u = self._speed * drive + min(limit, max(-limit, gain * along))
-        w = min(MAX_ACROSS, max(-MAX_ACROSS, gain * float(off @ n)))
+        u = self._speed * drive * math.cos(aside) + min(limit, max(-limit, gain * along))
+        w = min(MAX_ACROSS, max(-MAX_ACROSS, self._speed * drive * math.sin(aside) + gain * float(off @ n)))
         omega = self._speed * turning
         if 0.0 <= stamp - self._crossed < CROSSING_TIME and interval:
             # All at once: by the next pose, at the earliest within `CROSSING_STEP`.

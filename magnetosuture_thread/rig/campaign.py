@@ -19,7 +19,7 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, ThreadGoal, Wait, Wrap
 from magnetosuture_thread.planning.verdict import centre_of, winding
-from magnetosuture_thread.rig.closed_loop import ClosedLoop, LoopFrame, LoopRecorder, Vector
+from magnetosuture_thread.rig.closed_loop import LATENCY, ClosedLoop, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.rig.ground_truth import GoalTruth
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.rig.setups import Setup
@@ -40,11 +40,13 @@ class Variation:
         seed: that it is drawn by.
         setup: with the rig's settings as they are in truth; those of the nodes are as before.
         losses: share of the frames that get lost.
+        latency: from a frame to the command that follows from it [s].
     """
 
     seed: int
     setup: Setup
     losses: float = 0.05
+    latency: float = LATENCY
 
 
 def vary(setup: Setup, seed: int) -> Variation:
@@ -309,7 +311,8 @@ def run_procedure(
     planner.check(procedure)
     pilot, rig = _Pilot(procedure, planner), Rig(variation.setup.rig, setup.scene)
     execution = pilot.executor
-    loop = ClosedLoop(setup, rig, pilot, variation.seed, camera=camera, losses=variation.losses, recorder=recorder)
+    late = {"losses": variation.losses, "latency": variation.latency}
+    loop = ClosedLoop(setup, rig, pilot, variation.seed, camera=camera, recorder=recorder, **late)
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
     figures, truth_of_goals = extremes.figures, GoalTruth(procedure, setup.scene)

@@ -114,6 +114,7 @@ class ClosedLoop:
         seed: of noise and lost frames.
         camera: whether frames are rendered and tracked; else the tracker's noise is added to the truth.
         losses: share of the frames that get lost, 0 to 1.
+        latency: from a frame to the command that follows from it [s].
         recorder: gets what the nodes would publish; None for nobody.
     """
 
@@ -126,10 +127,12 @@ class ClosedLoop:
         *,
         camera: bool = False,
         losses: float = 0.0,
+        latency: float = LATENCY,
         recorder: LoopRecorder | None = None,
     ) -> None:
         self.setup, self.rig, self._controller, self._recorder = setup, rig, controller, recorder
         self._random, self._losses = np.random.default_rng([seed, 1]), losses
+        self._latency = latency
         latch, self._driver = ArmingLatch(), DriverState(True)
         self.bridge = CoilBridge(setup.coils, latch, setup.scene)
         latch.activate()
@@ -175,7 +178,7 @@ class ClosedLoop:
 
     def _measure(self, frame: RigFrame) -> Measurement | None:
         stamp = self.now + frame.stamp_delay
-        due = stamp + LATENCY
+        due = stamp + self._latency
         if self._tracker is None:
             deviation = np.array([1e-5, 1e-5, 5e-3])  # m and rad; of a tracked needle, see docs/results.md
             tail = frame.tail + deviation[:2] * self._random.standard_normal(2)

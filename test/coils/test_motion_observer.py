@@ -55,6 +55,16 @@ def test_no_more_of_a_pull_is_compensated_than_the_greatest_speed():
     assert math.hypot(*observer.velocity) == pytest.approx(0.01)
 
 
+def test_the_place_of_a_needle_is_the_less_known_the_later_and_the_rarer_its_poses_are():
+    assert MotionObserver(NEEDLE.kinematics).place_deviation(1.0) == 0.0
+    end = 1.0 + 390 * PERIOD  # the last pose of 20 a second
+    found = [observed(0.0, 0.0, 0.0, (0.0, 0.0)).place_deviation(end + age) for age in (0.0, 0.05, 0.1, 0.2)]
+    # What the pull changes by after the last pose, integrated until the next one is answered.
+    least = [math.sqrt(PULL_NOISE / 3.0 * (age + 0.05) ** 3) for age in (0.0, 0.05, 0.1, 0.2)]
+    assert all(least[k] < found[k] < 2.0 * least[k] for k in range(4))
+    assert sorted(found) == found
+
+
 def test_after_a_gap_between_poses_nothing_is_known():
     observer = observed(0.0, 0.0, 1e-3, (0.0, 0.0))
     observer.update(np.zeros(2), direction(0.3), 4.0)

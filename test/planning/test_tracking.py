@@ -36,12 +36,22 @@ def headings(
     age: float = 0.0,
     intervals: Sequence[float] = (1.0 / RATE,),
 ) -> np.ndarray:
-    """Return the headings of an ideal needle on a path, whose pull to the left of the path the coils compensate [rad].
+    """Return the headings of an ideal needle on a path [rad]; see `poses`."""
+    return poses(tracker, pull, age, intervals)[:, 2]
+
+
+def poses(
+    tracker: PathTracker,
+    pull: float,
+    age: float = 0.0,
+    intervals: Sequence[float] = (1.0 / RATE,),
+) -> np.ndarray:
+    """Return middle and heading of an ideal needle on a path, whose pull to the left of the path the coils compensate.
 
     A command comes into force when the pose that it answers has an age [s]. Poses come at intervals, in turns [s].
     """
     middle, angle = tracker.path.at(0.0)
-    found: list[float] = []
+    found: list[tuple[float, float, float]] = []
     now, twist, sent = 0.0, np.zeros(3), deque[tuple[float, np.ndarray]]()
     left = pull * np.array([-math.sin(angle), math.cos(angle)])
     for interval in islice(cycle(intervals), round(60.0 / min(intervals))):
@@ -57,7 +67,7 @@ def headings(
             e = np.array([math.cos(angle), math.sin(angle)])
             middle = middle + (until - now) * (twist[0] * e + twist[1] * np.array([-e[1], e[0]]))
             angle, now = angle + (until - now) * twist[2], until
-        found.append(angle)
+        found.append((float(middle[0]), float(middle[1]), angle))
     raise AssertionError("the end of the path is not reached")
 
 
@@ -68,6 +78,16 @@ def test_a_needle_that_is_pulled_aside_stays_off_the_axis_of_a_coil(axis: float,
     assert len(off) >= 6
     assert np.abs(off).min() >= 0.9 * abs(pull) / HELD
     assert np.all(off > 0.0) or np.all(off < 0.0) or not pull
+
+
+@pytest.mark.parametrize("age", [0.02, 0.1, 0.2])
+@pytest.mark.parametrize("pull", [1.2e-3, -1.2e-3])
+def test_a_needle_that_is_kept_off_an_axis_stays_on_its_path_however_late_its_poses_are(age: float, pull: float):
+    """Driven along itself it would leave the path until the place, corrected the less the later, brought it back."""
+    x, y, off = poses(PathTracker(path(np.zeros(80)), AXES), pull, age).T[:, round(1.5 * RATE) :]
+    assert np.abs(off).min() > 0.9 * abs(pull) / HELD
+    assert len(x) > 20
+    assert np.abs(y).max() < 3e-5
 
 
 @pytest.mark.parametrize("age", [0.0, 0.02, 0.045, 0.07, 0.12, 0.2])

@@ -16,6 +16,7 @@ from magnetosuture_thread.commands.campaign import CampaignResult, draw_campaign
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
 from magnetosuture_thread.rig.campaign import RunResult, run_procedure, vary
+from magnetosuture_thread.rig.closed_loop import LATENCY
 from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
 
 pytestmark = pytest.mark.slow
@@ -48,6 +49,11 @@ def test_a_near_place_is_reached_by_the_whole_loop(first: RunResult):
     assert (first.figures.max_thread_penetration_m, first.figures.wrap_degrees) == (0.0, 0.0)
     assert first.figures.max_tension_n > 0.0
     assert (first.last_instants, first.closest_instant) == ((), None)
+
+
+def test_a_hernia_is_repaired_with_poses_that_come_late(hernia: Setup):
+    found = run_procedure(read_procedure("hernia"), hernia, replace(vary(hernia, 703), latency=0.07))
+    assert (found.success, found.reason) == (True, "")
 
 
 def test_a_run_ends_at_a_fault_of_the_coil_bridge_and_names_it(hernia: Setup, short: Procedure):
@@ -150,4 +156,4 @@ def test_with_the_camera_the_tracker_measures(hernia: Setup, short: Procedure, m
     assert any(moved)
     assert not moved[0]
     assert moved[-1], "the picture of a run that failed has an arrow"
-    assert draw_campaign(CampaignResult(short, hernia, True, [found])).startswith(b"\x89PNG")
+    assert draw_campaign(CampaignResult(short, hernia, True, LATENCY, [found])).startswith(b"\x89PNG")

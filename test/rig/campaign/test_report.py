@@ -39,7 +39,7 @@ def test_a_campaign_is_drawn_with_the_dish_of_each_failed_run(failures: int):
     close = replace(GOOD, min_needle_clearance_m=0.0002)
     runs = [RunResult(0, True, "", True, 5, GOOD, 81.0)]
     runs += [failed(seed, close, "too <close>", instant(20.0, 0.0002)) for seed in range(1, failures + 1)]
-    result = CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, runs)
+    result = CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, 0.02, runs)
     picture = imread(io.BytesIO(draw_campaign(result)), format="png")[..., :3]
     assert (np.abs(picture - np.array([0xC8, 0x10, 0x2E]) / 255).max(axis=2) < 0.05).any() == bool(failures)
 
