@@ -90,12 +90,19 @@ class MotionObserver:
     def place_deviation(self, now: float) -> float:
         """Return the standard deviation of the place, in each direction, until a next pose can be answered [m].
 
-        That is an interval of poses from now: 0 before the first pose.
+        That is the time a = age + T from the last pose, with the interval T of poses. Carried on by its mean velocity
+        between the last two, a middle whose velocity changes as a pull does is off by
+
+            s^2 = `PULL_NOISE` a^2 (a + T) / 3 + `PLACE_DEVIATION`^2 ((1 + a / T)^2 + (a / T)^2)
+
+        0 before there are two poses, as no pull is known then.
         """
-        if self._seen is None:
+        interval = self._interval
+        if self._last is None or not interval:
             return 0.0
-        interval = min(MAX_GAP, max(0.0, now - self._seen[0]) + self._interval)
-        return math.sqrt(self._grown(interval)[0, 0])
+        after = min(MAX_GAP, max(0.0, now - self._last[0]) + interval)
+        drift, share = PULL_NOISE * after**2 * (after + interval) / 3.0, after / interval
+        return math.sqrt(drift + PLACE_DEVIATION**2 * ((1.0 + share) ** 2 + share**2))
 
     def update(
         self, tail: Vector, heading: Vector, stamp: float, trusted: bool = False, stamp_deviation: float = 0.0
@@ -156,13 +163,9 @@ class MotionObserver:
 
     def _predicted(self, interval: float, applied: Vector) -> tuple[Vector, Vector]:
         """Return place [m] and covariance after an interval [s] with a velocity by the currents, shape (2,) [m/s]."""
-        return self._place + interval * (applied + self._velocity), self._grown(interval)
-
-    def _grown(self, interval: float) -> Vector:
-        """Return the covariance of place and velocity after an interval [s], shape (2, 2)."""
         step = np.array([[1.0, interval], [0.0, 1.0]])
         noise = PULL_NOISE * np.array([[interval**3 / 3.0, interval**2 / 2.0], [interval**2 / 2.0, interval]])
-        return np.asarray(step @ self._covariance @ step.T + noise)
+        return self._place + interval * (applied + self._velocity), step @ self._covariance @ step.T + noise
 
     def apply(self, now: float, applied: Vector, intended: Vector, turn_rate: float) -> None:
         """Register what currents are set for from a time on.
@@ -183,6 +186,7 @@ class MotionObserver:
         if self._applied and now < self._applied[-1][0]:
             self._applied.clear()  # time was set back
             self._last = self._seen = None
+            self._velocity = np.zeros(2)
         self._applied.append((now, velocity))
         while len(self._applied) > 1 and self._applied[1][0] < now - MAX_GAP:
             self._applied.popleft()

@@ -45,7 +45,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--first-seed", type=first, default=0, metavar="K", help="seed of the first run (default: 0)")
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
     command.add_rig(parser)
-    latency = f"from a frame to the command that follows from it [s] (default: {LATENCY:g})"
+    latency = f"time from a frame to the command that follows from it [s] (default: {LATENCY:g})"
     option("--latency", type=command.number_argument(0.0, 1.0), default=LATENCY, metavar="S", help=latency)
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
     bags = "seeds whose runs are recorded as bags (default: none)"
@@ -174,6 +174,7 @@ def _run(
     if folder is not None and not folder.parents[1].is_dir():
         raise BagError(folder, "cannot be recorded: this worker does not have the output's folder")
     what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}, seed {seed}"
+    what += f", latency {latency:g} s"
     notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))

@@ -84,10 +84,10 @@ class PathTracker:
         max(min(|d_a| / a, `MAX_ANGLE`), min(|d| / a, `MAX_AXIS_ANGLE`))
 
     with the velocity a that the coils hold for each radian, on the side of theta_r, and jumps to the other side when
-    theta_r crosses. The way is still along theta_r + delta, not along the needle. A thread that holds the tail
-    displaces the middle in that turn: before it the place is b, half of that to the side that the needle comes from.
-    All of theta - theta_r stays within what half of the path's leeway allows. Corrections of the direction are raised
-    by as much as the bridge slows them, within the same limits.
+    theta_r crosses. Where no pull is measured, and so none compensated, u_r is along the needle. A thread that holds
+    the tail displaces the middle in that turn: before it the place is b, half of that to the side that the needle comes
+    from. All of theta - theta_r stays within what half of the path's leeway allows. Corrections of the direction are
+    raised by as much as the bridge slows them, within the same limits.
 
     Source: line-of-sight guidance of ships, Fossen 2011, section 10.3; for the place, proportional control of a
     fully actuated one. Deviation: the weight of the two, by what force is left.
@@ -158,7 +158,8 @@ class PathTracker:
         gain = min(MAX_PLACE_GAIN, delayed_gain(age, interval))
         steered = self._steered(angle, abs(float(pull @ n)) + gain * abs(across))
         course = min(allowed, max(-allowed, steered * driven * sense * math.atan(across / LOOKAHEAD)))
-        aside = turn + course  # of the way, to the left of the needle [rad]
+        # Of the way, to the left of the needle [rad]; along itself where nobody is known to move it across.
+        aside = turn + course if pull.any() else 0.0
         off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, pull)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
@@ -174,7 +175,7 @@ class PathTracker:
         turn += course
         limit = MAX_ALONG_RATIO * speed
         u = self._speed * drive * math.cos(aside) + min(limit, max(-limit, gain * along))
-        w = min(MAX_ACROSS, max(-MAX_ACROSS, self._speed * drive * math.sin(aside) + gain * float(off @ n)))
+        w = self._speed * drive * math.sin(aside) + min(MAX_ACROSS, max(-MAX_ACROSS, gain * float(off @ n)))
         omega = self._speed * turning
         if 0.0 <= stamp - self._crossed < CROSSING_TIME and interval:
             # All at once: by the next pose, at the earliest within `CROSSING_STEP`.

@@ -90,6 +90,23 @@ def test_a_needle_that_is_kept_off_an_axis_stays_on_its_path_however_late_its_po
     assert np.abs(y).max() < 3e-5
 
 
+@pytest.mark.parametrize("drive", [1.0, -1.0])
+def test_a_needle_whose_pull_nobody_measures_is_driven_along_itself(drive: float):
+    """Nothing moves it across then: that would be taken for a turn, the wrong way round where it is driven back."""
+    forth = path(np.zeros(60))
+    back = BodyPath(forth.middles[::-1].copy(), forth.angles, forth.lever, forth.leeway, forth.ends)
+    across = []
+    for pull in (0.0, 1e-3):
+        tracker = PathTracker(forth if drive > 0.0 else back)
+        for frame in range(20):
+            middle, angle = tracker.path.at(tracker.travel)
+            command = tracker.compute_command(frame / RATE, middle, angle + 0.1, 0.002, 1.0, np.array([pull, 0.0]))
+        assert command.twist[0] * drive > 1e-3
+        across.append(command.twist[1])
+    assert abs(across[0]) < 1e-4
+    assert across[1] * drive < -1.5e-4
+
+
 @pytest.mark.parametrize("age", [0.0, 0.02, 0.045, 0.07, 0.12, 0.2])
 @pytest.mark.parametrize("rate", [10.0, 20.0, 30.0, 60.0])
 def test_an_axis_is_crossed_at_once_and_no_farther_than_the_needle_stays_off_it(age: float, rate: float):
