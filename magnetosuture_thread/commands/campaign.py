@@ -173,8 +173,8 @@ def _run(
     began, (seed, folder) = process_time(), task
     if folder is not None and not folder.parents[1].is_dir():
         raise BagError(folder, "cannot be recorded: this worker does not have the output's folder")
-    what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}, seed {seed}"
-    what += f", latency {latency:g} s"
+    what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}"
+    what += f", latency {latency:g} s, seed {seed}"
     notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
