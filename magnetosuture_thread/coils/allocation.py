@@ -294,8 +294,8 @@ class CoilAllocation:
                 target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
                 currents = self._bounded_least_squares(system, target, lower, upper)
             before, field = field, max(float(along_field @ currents), least)
-            last, now = doubt, self._doubt(measured, float(bend @ currents), across_field * currents, field)
-            doubt = math.sqrt(last * now)
+            last, solved = doubt, self._doubt(measured, float(bend @ currents), across_field * currents, field)
+            doubt = math.sqrt(last * solved)
             if max(abs(field - before) / before, abs(doubt - last) / last) <= FIELD_TOLERANCE:
                 break
         found = self.motion(currents, tail, heading, balance)

@@ -117,10 +117,10 @@ class Polygon:
         """
         least = (1.0 - 1e-3) * radius
         for tolerance in (0.1 * radius, 1e-3 * radius):
-            found = shapely.maximum_inscribed_circle(self.solid, tolerance).length
-            if found >= least or found + tolerance < least:
+            inscribed = shapely.maximum_inscribed_circle(self.solid, tolerance).length
+            if inscribed >= least or inscribed + tolerance < least:
                 break
-        return bool(found >= least)
+        return bool(inscribed >= least)
 
     def smoothed(self, radius: float, step: float = math.pi / 18) -> Polygon:
         """Return the polygon with its sharp corners rounded by arcs tangent to both edges.
