@@ -43,6 +43,7 @@ INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
 EXTRA_TIME = 20.0  # s of simulated time
 MIN_RATE = 0.5  # of real time; the least that the rig's setting `rate` takes
+MAX_PAUSE = 30.0  # s; in which a person resumes a procedure that does not go on by itself, or nobody is there
 MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another camera than the setup's
 
 
@@ -77,7 +78,8 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
 
     With --bare nothing steers: the dish waits for `commission --live`. With --procedure, needle_planner executes it in
     place of path_follower. Whether it succeeded, or why it failed, is at the end of the table, and in summary.json in
-    BAG. Where the computer skips a tenth of the frames or more, that is the reason: a lower --rate gives it more time.
+    BAG; one that waits for a person fails after 30 s, unless somebody resumes it. Where the computer skips a tenth of
+    the frames or more, that is the reason: a lower --rate gives it more time.
 
     SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
     exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
@@ -244,13 +246,14 @@ class _Path:
         stage: 0 before the node is there, 1 before the needle moves, 2 from then on.
         share: that is done, 0 to 1.
         ended: whether it is done.
+        stuck: why it goes on no more by itself; empty while it does.
         result: what came of a procedure; None for a path.
     """
 
     node = "path_follower"
     arguments: tuple[str, ...] = ()
     recorded: tuple[topics.Topic, ...] = ()
-    stage, share, ended = 0, 0.0, False
+    stage, share, ended, stuck = 0, 0.0, False, ""
     result: dict[str, Any] | None = None
 
     def __init__(self, setup: Setup, duration: float | None) -> None:
@@ -288,7 +291,7 @@ class _Procedure:
     node = interface.PLANNER
     recorded = topics.PROCEDURES
     time_limit = 600.0  # s of simulated time, as in a campaign
-    stage, share, ended = 0, 0.0, False
+    stage, share, ended, stuck = 0, 0.0, False, ""
 
     def __init__(self, name: str, setup: Setup) -> None:
         procedure = read_procedure(name)
@@ -299,6 +302,7 @@ class _Procedure:
         self.result |= {"goals": len(procedure.goals), "min_clearance_m": None}
         self._file = str(find_file("procedure", name).resolve())
         self._client: clients.ProcedureClient | None = None  # once the graph runs
+        self._went_on = math.inf  # monotonic time until which it was not paused [s]
 
     def poll(self, recorder: clients.Recorder) -> None:
         """Take what is new."""
@@ -310,10 +314,14 @@ class _Procedure:
             self.stage = 2
             self.share = (status.goals_met + status.progress) / self.result["goals"]
             self.result["min_clearance_m"] = finite_or_none(status.clearance)
+            if status.state != status.STATE_PAUSED or status.resumes:
+                self._went_on = time.monotonic()
         for report in (status, result):
             if report is not None:
                 state = clients.procedure_state(report)
                 self.result |= {"state": state, "reason": report.reason, "goals_met": report.goals_met}
+        if time.monotonic() > self._went_on + MAX_PAUSE:
+            self.stuck = f"nobody resumes the procedure: {self.result['reason']}"
         self.ended = result is not None
 
     def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
@@ -330,7 +338,7 @@ class _Bare:
     node = ""
     arguments = tuple(live.arguments_of({"coil_bridge:commissioning": "true"}))
     recorded: tuple[topics.Topic, ...] = ()
-    time_limit, stage, share, ended = math.inf, 2, 0.0, False
+    time_limit, stage, share, ended, stuck = math.inf, 2, 0.0, False, ""
     result: dict[str, Any] | None = None
 
     def poll(self, recorder: clients.Recorder) -> None:
@@ -429,9 +437,10 @@ class _Run:
             elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
             self.progress(task.share if duration is None else min(1.0, elapsed / duration) * bool(stage))
             fault = recorder.status_texts.get("coil_bridge", ("", {}))[0]
-            if task.ended or (task.node and fault.startswith("fault: ")):  # after which the needle rests for good
+            stuck = f"coil_bridge: {fault}" if task.node and fault.startswith("fault: ") else task.stuck
+            if task.ended or stuck:  # after which the needle rests for good
                 recorder.spin(0.5 / rate)
-                return "" if task.ended else f"coil_bridge: {fault}"
+                return "" if task.ended else stuck
             if duration is not None and stage and elapsed > duration + (EXTRA_TIME if stage == 1 else 0.0):
                 return ""
             if elapsed > (task.time_limit if stage else live.START_TIMEOUT):

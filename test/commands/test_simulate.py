@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 import signal
@@ -15,16 +16,26 @@ from unittest.mock import create_autospec
 import cv2
 import numpy as np
 import pytest
+from std_srvs.srv import Trigger
 
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands import reproduce
+from magnetosuture_thread.commands import simulate as simulate_command
 from magnetosuture_thread.commands.simulate import SUMMARY_FILE, host_bare_rig, simulate
 from magnetosuture_thread.geometry.scene_files import read_scene
+from magnetosuture_thread.nodes.clients import Participant, Services
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
-from magnetosuture_thread.settings.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, SCENE, TIP_SETPOINT
+from magnetosuture_thread.settings.interface import (
+    NEEDLE_COMMAND,
+    PROCEDURE_PLAN,
+    PROCEDURE_STATE,
+    SCENE,
+    TIP_SETPOINT,
+    Service,
+)
 
 pytestmark = pytest.mark.whole_graph
 
@@ -148,6 +159,27 @@ def test_a_run_whose_bridge_is_stopped_ends_with_the_reason(scenario: Path, tmp_
     states = [record.decode() for record in Bag(bag).records({"/coils/state"})]
     assert states[-1].emergency_stopped
     assert not any(states[-1].current)
+
+
+def test_a_procedure_that_nobody_resumes_ends_the_run_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(simulate_command, "MAX_PAUSE", 1.0)
+    (tmp_path / "near.yaml").write_text(NEAR)
+    (tmp_path / "open.yaml").write_text(OPEN)
+
+    def pause(share: float) -> None:
+        if share and not paused:
+            paused.append(True)
+            with Participant("person") as person:
+                services = Services(person.node, {Service.PAUSE_PROCEDURE: Service.PAUSE_PROCEDURE.type_name})
+                assert asyncio.run(services.call(Service.PAUSE_PROCEDURE, Trigger.Request(), timeout=10.0)).success
+
+    paused: list[bool] = []
+    bag = tmp_path / "bag"
+    procedure = str(tmp_path / "near.yaml")
+    simulate(str(tmp_path / "open.yaml"), bag, rate=0.5, procedure=procedure, progress=pause)
+    outcome = json.loads((bag / SUMMARY_FILE).read_text())["procedure"]
+    assert outcome["state"] == "failed"
+    assert outcome["reason"] == "nobody resumes the procedure: paused by a person"
 
 
 def test_under_faults_the_tracker_is_right_or_silent_and_boards_are_driven_by_the_real_driver(tmp_path: Path):
