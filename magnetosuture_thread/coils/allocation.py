@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.field import LoopCoils, fields_per_current
 from magnetosuture_thread.coils.filter import SPEED, NeedleSafetyFilter
 from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist
+from magnetosuture_thread.geometry.compiled import TypedKernel, compiled
 
 Vector = NDArray[np.float64]
 Certificate = Callable[["Allocation"], tuple[float, str]]
@@ -33,6 +34,7 @@ COIL_ERROR = 0.015  # of a coil's field, with its gain estimated: in some second
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 FIELD_ROUNDS, FIELD_TOLERANCE = 6, 0.03  # solutions, until the field along the needle is known to this share
 LEAST_FIELD = 1e-6  # T; in a weaker one the needle is turned by its torque alone
+MAX_EXCHANGES = 50  # of currents at and off their limits; as many as there are combinations of four coils, and more
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
 BISECTIONS = 7  # of the certified share: to 1 %, and never beyond it
@@ -119,6 +121,229 @@ class PoseDeviation(NamedTuple):
 EXACT = PoseDeviation()
 
 
+class AllocationData(NamedTuple):
+    """What the kernels read of coils and needle.
+
+    Attributes:
+        axes: unit vectors to the coils, shape (2, m).
+        numbers: distance, radius and field of each coil, see `fields_per_current`, shape (3, m).
+        gains: factors on their fields, shape (m,).
+        chord: l [m].
+        along: velocity along the chord for a difference of one tesla between its ends, q / drag [m/s/T].
+        across: the same across it, q / drag_across [m/s/T].
+        slow: turning_drag / (q l) [T s].
+        field: B_0 [T].
+        max_current: [A].
+        period: T [s].
+    """
+
+    axes: Vector
+    numbers: Vector
+    gains: Vector
+    chord: float
+    along: float
+    across: float
+    slow: float
+    field: float
+    max_current: float
+    period: float
+
+
+class Request(NamedTuple):
+    """What is to be allocated; see `CoilAllocation.allocate`.
+
+    Attributes:
+        along: velocity along the chord [m/s].
+        across: velocity across it [m/s].
+        turn_rate: [rad/s].
+        place: deviation of the needle's place [m].
+        stamp: deviation of the time of its pose [s].
+        balance: b [T].
+        at_tip: whether the tip is to move so.
+        previous: currents of before; zeros if there are none, shape (m,) [A].
+        lower: least currents, shape (m,) [A].
+        upper: greatest currents, shape (m,) [A].
+    """
+
+    along: float
+    across: float
+    turn_rate: float
+    place: float
+    stamp: float
+    balance: float
+    at_tip: bool
+    previous: Vector
+    lower: Vector
+    upper: Vector
+
+
+@compiled
+def needle_rows(data: AllocationData, x: float, y: float, ex: float, ey: float) -> Vector:
+    """Return what one ampere in each coil gives a needle, shape (4, m).
+
+    Args:
+        data: of coils and needle.
+        x: of its chord's middle [m].
+        y: of it [m].
+        ex: unit vector along the chord.
+        ey: the same.
+
+    Returns:
+        Velocity along the chord and across it, to its left [m/s]; mean field across it and along it [T].
+    """
+    h, rows = 0.5 * data.chord, np.empty((4, len(data.gains)))
+    at_tail = fields_per_current(x - h * ex, y - h * ey, data.axes, data.numbers)
+    at_tip = fields_per_current(x + h * ex, y + h * ey, data.axes, data.numbers)
+    for k, gain in enumerate(data.gains):
+        pull_x, pull_y = gain * (at_tip[0, k] - at_tail[0, k]), gain * (at_tip[1, k] - at_tail[1, k])
+        mean_x, mean_y = 0.5 * gain * (at_tip[0, k] + at_tail[0, k]), 0.5 * gain * (at_tip[1, k] + at_tail[1, k])
+        rows[0, k] = data.along * (ex * pull_x + ey * pull_y)
+        rows[1, k] = data.across * (ex * pull_y - ey * pull_x)
+        rows[2, k], rows[3, k] = ex * mean_y - ey * mean_x, ex * mean_x + ey * mean_y
+    return rows
+
+
+@compiled
+def response(data: AllocationData, field: float) -> float:
+    """Return the field across the needle by which it turns, in a field along it [T], for 1 rad/s [T s]."""
+    if data.period == 0.0:
+        return data.slow
+    return data.period * field / -math.expm1(-data.period * field / data.slow)
+
+
+@compiled
+def least_squares(system: Vector, target: Vector, free: NDArray[np.bool_], found: Vector) -> None:
+    """Write the x of least |system x - target| into `found` where x is free; elsewhere it stays.
+
+    By Householder's reflections of the columns that are free (Golub and Van Loan, Matrix Computations, algorithm
+    5.3.2). These must be independent.
+
+    Args:
+        system: shape (k, m).
+        target: shape (k,).
+        free: shape (m,).
+        found: x, shape (m,).
+    """
+    columns = np.flatnonzero(free)
+    rest, matrix = target - system @ np.where(free, 0.0, found), system[:, columns]
+    for j in range(len(columns)):
+        size = math.sqrt(np.sum(matrix[j:, j] ** 2))
+        v = matrix[j:, j].copy()
+        v[0] += math.copysign(size, v[0])
+        scale = 2.0 / np.sum(v * v)
+        for k in range(j, len(columns)):
+            matrix[j:, k] -= scale * np.sum(v * matrix[j:, k]) * v
+        rest[j:] -= scale * np.sum(v * rest[j:]) * v
+    for j in range(len(columns) - 1, -1, -1):
+        for k in range(j + 1, len(columns)):
+            rest[j] -= matrix[j, k] * rest[k]
+        rest[j] /= matrix[j, j]
+        found[columns[j]] = rest[j]
+
+
+@compiled
+def bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
+    """Return the x of least |system x - target| within bounds, shape (m,).
+
+    Source: Stark and Parker, Bounded-variable least squares, Computational Statistics 10, 1995: unknowns are fixed at a
+    bound that stops the way to the solution without them, and freed where the residual decreases off it. Deviation:
+    begins at the unbounded solution, within bounds; most often that is the solution.
+
+    Args:
+        system: of full rank, shape (k, m).
+        target: shape (k,).
+        lower: bounds, shape (m,).
+        upper: at least as great, shape (m,).
+    """
+    free = np.ones(len(lower), np.bool_)
+    x = np.zeros(len(lower))
+    least_squares(system, target, free, x)
+    if np.all(x >= lower) and np.all(x <= upper):
+        return x
+    free = (x > lower) & (x < upper)
+    x = np.minimum(np.maximum(x, lower), upper)
+    for _ in range(MAX_EXCHANGES):
+        aim = x.copy()
+        least_squares(system, target, free, aim)
+        part, stop = 1.0, -1
+        for k in range(len(x)):
+            bound = upper[k] if aim[k] > x[k] else lower[k]
+            if free[k] and (aim[k] - bound) * (aim[k] - x[k]) > 0.0 and (bound - x[k]) / (aim[k] - x[k]) < part:
+                part, stop = (bound - x[k]) / (aim[k] - x[k]), k
+        x += part * (aim - x)
+        if stop >= 0:
+            free[stop] = False
+            x[stop] = upper[stop] if aim[stop] > x[stop] else lower[stop]
+            continue
+        gain = system.T @ (target - system @ x)
+        worst, best = -1, 0.0
+        for k in range(len(x)):
+            inward = gain[k] if x[k] == lower[k] else -gain[k]
+            if not free[k] and lower[k] < upper[k] and inward > best:
+                worst, best = k, inward
+        if worst < 0:
+            break
+        free[worst] = True
+    return np.minimum(np.maximum(x, lower), upper)
+
+
+@compiled
+def allocate_currents(data: AllocationData, request: Request, x: float, y: float, ex: float, ey: float) -> Vector:
+    """Return the currents for a motion of a needle, shape (m,) [A]; see `CoilAllocation` and `needle_rows`."""
+    lever, least, count = 0.5 * data.chord, MIN_ALIGNING_SHARE * data.field, len(data.gains)
+    rows = needle_rows(data, x, y, ex, ey)
+    c, s = math.cos(HEADING_STEP), math.sin(HEADING_STEP)
+    # What an error of the heading would do: in a crossing it is on the other side of the axis. And one of the place.
+    turned = needle_rows(data, x, y, c * ex - s * ey, c * ey + s * ex)
+    beside = needle_rows(data, x - PLACE_STEP * ey, y + PLACE_STEP * ex, ex, ey)
+    # From the field at one pole alone: velocities count by the force that they take.
+    along_speed, across_speed = data.along * data.field, data.across * data.field
+    system, target = np.zeros((5 + count, count)), np.zeros(5 + count)
+    misaligned, bend = np.zeros(count), request.place / PLACE_STEP * (beside[2] - rows[2])
+    for k in range(count):
+        system[0, k], system[3, k] = rows[0, k] / along_speed, rows[1, k] / across_speed
+        system[2, k] = ALIGN_WEIGHT / data.field * rows[3, k]
+        system[5 + k, k] = CURRENT_WEIGHT / data.max_current
+        if not request.at_tip:  # else a drift by such an error is corrected by the turn, as any other
+            # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
+            # the needle takes large currents whose fields cancel each other, and their errors do not.
+            swung = lever / CORRECTION_TIME * rows[2, k] / least
+            drift = COIL_ERROR / across_speed * math.hypot(rows[1, k], swung)
+            system[5 + k, k] = math.hypot(system[5 + k, k], drift)
+            misaligned[k] = (turned[1, k] - rows[1, k]) / (HEADING_STEP * across_speed)
+    target[0], target[2], target[3] = request.along / along_speed, ALIGN_WEIGHT, request.across / across_speed
+    measured = HEADING_ERROR**2 + (request.turn_rate * request.stamp) ** 2
+    currents, field, doubt = request.previous, data.field, math.sqrt(measured)
+    for number in range(FIELD_ROUNDS + 1):
+        before, last = field, doubt
+        if number or np.any(currents != 0.0):  # from which what is looked for is not far
+            field = max(np.sum(rows[3] * currents), least)
+            bent, error = np.sum(bend * currents), COIL_ERROR**2 * np.sum((rows[2] * currents) ** 2)
+            doubt = math.sqrt(measured + (bent**2 + error) / field**2)
+        if number:
+            doubt = math.sqrt(last * doubt)
+            is_known = abs(field - before) <= FIELD_TOLERANCE * before and abs(doubt - last) <= FIELD_TOLERANCE * last
+            if is_known or number == FIELD_ROUNDS:
+                break
+        resistance = response(data, field)
+        # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
+        max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * field / resistance
+        speed = lever * request.turn_rate + lever / resistance * request.balance
+        weight = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
+        system[1] = weight * lever / resistance * rows[2]
+        if request.at_tip:
+            system[1] += weight * rows[1]
+        target[1] = weight * min(max_turn_speed, max(-max_turn_speed, speed))
+        system[2], target[2] = ALIGN_WEIGHT / data.field * rows[3], ALIGN_WEIGHT
+        system[4] = doubt * misaligned
+        currents = bounded_least_squares(system, target, request.lower, request.upper)
+        if np.sum(rows[3] * currents) < least:
+            # A constraint that the optimum violates is active in the constrained optimum.
+            system[2], target[2] = CONSTRAINT_WEIGHT / data.field * rows[3], CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
+            currents = bounded_least_squares(system, target, request.lower, request.upper)
+    return currents
+
+
 class CoilAllocation:
     """Allocates coil currents for a velocity of the needle's tip.
 
@@ -157,41 +382,37 @@ class CoilAllocation:
     Attributes:
         response_time: T / (1 - exp(-T / tau)) with B . e = B_0, in which a needle turns by its angle to the field [s].
         names: of the coils, in the order of their currents.
-        gains: by which factor each coil's field differs from its calibration, shape (m,); 1 until something is known.
     """
 
     def __init__(
         self, coils: LoopCoils, needle: NeedleMechanics, aligning_field: float, max_current: float, period: float = 0.0
     ) -> None:
-        # Here, so that it delays no command, and nobody who reads settings alone.
-        from scipy.optimize import lsq_linear
-
-        self._solve_bounded = lsq_linear
         self.names = coils.names
-        self._coils = coils
         self._needle = needle
-        self._field = aligning_field
-        self._max_current = max_current
-        self.gains = np.ones(len(self.names))
-        self._period = period
-        self.response_time = self._response(aligning_field) / aligning_field
+        self._data = AllocationData(
+            axes=coils.axes,
+            numbers=coils.numbers,
+            gains=np.ones(len(coils.names)),
+            chord=float(needle.chord),
+            along=float(needle.pole / needle.drag),
+            across=float(needle.pole / needle.drag_across),
+            slow=float(needle.turning_drag / (needle.pole * needle.chord)),
+            field=float(aligning_field),
+            max_current=float(max_current),
+            period=float(period),
+        )
+        self._allocate, self._kernel_rows = TypedKernel(allocate_currents), TypedKernel(needle_rows)
+        self.response_time = response(self._data, aligning_field) / aligning_field
+        self.allocate(NeedleTwist(), np.zeros(2), np.array([1.0, 0.0]))  # so that no command waits for a compiler
 
-    def _response(self, field: float) -> float:
-        """Return the field across the needle by which it turns, in a field along it [T], for 1 rad/s [T s]."""
-        slow = self._needle.turning_drag / (self._needle.pole * self._needle.chord)
-        return self._period * field / -math.expm1(-self._period * field / slow) if self._period else slow
+    @property
+    def gains(self) -> Vector:
+        """By which factor each coil's field differs from its calibration, shape (m,); 1 until something is known."""
+        return self._data.gains
 
-    @staticmethod
-    def _doubt(measured: float, bent: float, across: Vector, field: float) -> float:
-        """Return the deviation of the heading [rad].
-
-        Args:
-            measured: of the measured heading, carried to now [rad].
-            bent: deviation of the field across the needle by that of its place [T].
-            across: field of each coil across the needle, shape (m,) [T], with an error of `COIL_ERROR`.
-            field: along it [T].
-        """
-        return math.hypot(measured, bent / field, COIL_ERROR * float(np.linalg.norm(across)) / field)
+    @gains.setter
+    def gains(self, gains: Vector) -> None:
+        self._data = self._data._replace(gains=np.array(gains, dtype=np.float64))
 
     def slack_speed(self, allocation: Allocation, heading: Vector) -> float:
         """Return the speed that the force of allocated currents gives a needle that lies along it, with a slack thread.
@@ -237,67 +458,16 @@ class CoilAllocation:
             at_tip: whether the tip is to move as it would by that motion: then the needle turns against what the
                 currents add across it, and errors do not count. Else it turns as commanded.
         """
-        needle = self._needle
-        e = needle.chord_direction(heading)
-        n = np.array([-e[1], e[0]])
-        lever = 0.5 * needle.chord
-        middle = tail + lever * e
-        along, across, across_field, along_field = self._rows(middle, e)
-        # From the field at one pole alone: velocities count by the force that they take.
-        along_speed, across_speed = (needle.pole * self._field / drag for drag in (needle.drag, needle.drag_across))
-        # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
-        # the needle takes large currents whose fields cancel each other, and their errors do not.
-        swung = lever / CORRECTION_TIME * across_field / (MIN_ALIGNING_SHARE * self._field)
-        effort = np.hypot(CURRENT_WEIGHT / self._max_current, COIL_ERROR / across_speed * np.hypot(across, swung))
-        # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
-        beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
-        measured = math.hypot(HEADING_ERROR, twist.turn_rate * deviation.stamp)
-        bend = deviation.place / PLACE_STEP * (self._rows(middle + PLACE_STEP * n, e)[2] - across_field)
-        misaligned = (self._rows(middle, beside)[1] - across) / (HEADING_STEP * across_speed)
-        if at_tip:  # a drift by such an error is corrected by the turn, as any other
-            effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
-        system = np.vstack(
-            [
-                along / along_speed,
-                np.zeros(len(self.names)),
-                ALIGN_WEIGHT / self._field * along_field,
-                across / across_speed,
-                np.zeros(len(self.names)),
-                np.diag(effort),
-            ]
-        )
-        target = np.zeros(len(system))
-        target[:4] = twist.along / along_speed, 0.0, ALIGN_WEIGHT, twist.across / across_speed
-        limit = np.full(len(self.names), self._max_current)
-        lower, upper = -limit, limit
+        e, lever = self._needle.chord_direction(heading), 0.5 * self._needle.chord
+        n, middle = np.array([-e[1], e[0]]), tail + lever * e
+        limit = np.full(len(self.names), self._data.max_current)
+        lower, upper, before = -limit, limit, np.zeros(len(self.names))
         if previous is not None:
-            lower, upper = (np.clip(previous + change, -limit, limit) for change in (-max_change, max_change))
-        field, least = self._field, MIN_ALIGNING_SHARE * self._field
-        doubt = measured
-        if previous is not None and previous.any():  # from which what is looked for is not far
-            field = max(float(along_field @ previous), least)
-            doubt = self._doubt(measured, float(bend @ previous), across_field * previous, field)
-        for _ in range(FIELD_ROUNDS):
-            system[4] = doubt * misaligned
-            response = self._response(field)
-            turning, torque = lever / response * across_field, lever / response * balance
-            # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
-            max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * field / response
-            turned = min(max_turn_speed, max(-max_turn_speed, lever * twist.turn_rate + torque))
-            turn_weight = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
-            system[1] = turn_weight * (turning + across if at_tip else turning)
-            target[1] = turn_weight * turned
-            currents = self._bounded_least_squares(system, target, lower, upper)
-            if along_field @ currents < least:
-                # A constraint that the optimum violates is active in the constrained optimum.
-                system[2] = CONSTRAINT_WEIGHT / self._field * along_field
-                target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
-                currents = self._bounded_least_squares(system, target, lower, upper)
-            before, field = field, max(float(along_field @ currents), least)
-            last, solved = doubt, self._doubt(measured, float(bend @ currents), across_field * currents, field)
-            doubt = math.sqrt(last * solved)
-            if max(abs(field - before) / before, abs(doubt - last) / last) <= FIELD_TOLERANCE:
-                break
+            before = np.array(previous, dtype=np.float64)
+            lower, upper = (np.clip(before + change, -limit, limit) for change in (-max_change, max_change))
+        along, across, turn_rate, place, stamp, torque = map(float, (*twist, *deviation, balance))
+        request = Request(along, across, turn_rate, place, stamp, torque, bool(at_tip), before, lower, upper)
+        currents = self._allocate(self._data, request, *middle.tolist(), *e.tolist())
         found = self.motion(currents, tail, heading, balance)
         wanted = twist.along * e + (lever * twist.turn_rate + twist.across) * n
         inaccurate = math.hypot(*(found.velocity - wanted)) > SATURATION_TOLERANCE * math.hypot(*wanted)
@@ -308,19 +478,12 @@ class CoilAllocation:
         e = self._needle.chord_direction(heading)
         lever, n = 0.5 * self._needle.chord, np.array([-e[1], e[0]])
         along, drift, across_field, field = (self._rows(tail + lever * e, e) @ currents).tolist()
-        swing = lever * (across_field - balance) / self._response(max(field, LEAST_FIELD))
+        swing = lever * (across_field - balance) / response(self._data, max(field, LEAST_FIELD))
         return Allocation(currents, along * e + (swing + drift) * n, False, drift)
 
     def _rows(self, middle: Vector, e: Vector) -> Vector:
-        """Return what one ampere in each coil gives a needle with its chord along e, shape (4, m).
-
-        Rows: velocity along the chord and across it, to its left [m/s]; mean field across it and along it [T].
-        """
-        needle, n = self._needle, np.array([-e[1], e[0]])
-        at_tail = self.gains * self._coils.per_current(middle - 0.5 * needle.chord * e)
-        at_tip = self.gains * self._coils.per_current(middle + 0.5 * needle.chord * e)
-        pull, mean = needle.pole * (at_tip - at_tail), 0.5 * (at_tail + at_tip)
-        return np.vstack([e @ pull / needle.drag, n @ pull / needle.drag_across, n @ mean, e @ mean])
+        """Return what one ampere in each coil gives a needle with its chord along e; see `needle_rows`."""
+        return np.asarray(self._kernel_rows(self._data, *middle.tolist(), *e.tolist()))
 
     def axes(self) -> tuple[tuple[float, float], ...]:
         """Return the directions, of half a turn, in which the coils hold no needle against a pull across it.
@@ -349,7 +512,7 @@ class CoilAllocation:
             return float(np.linalg.norm(rows[1] - kept @ (kept.T @ rows[1])))
 
         field = float(np.linalg.norm(self._rows(np.zeros(2), np.array([1.0, 0.0]))[2:], axis=0).max())
-        current = min(HEADING_ERROR * self._field / (COIL_ERROR * field), self._max_current)
+        current = min(HEADING_ERROR * self._data.field / (COIL_ERROR * field), self._data.max_current)
         found, axes = np.array([authority(angle) for angle in np.radians(np.arange(180.0))]), []
         minima = (found < np.roll(found, 1)) & (found <= np.roll(found, -1)) & (found < 0.5 * found.max())
         for angle in np.radians(np.flatnonzero(minima)).tolist():
@@ -357,16 +520,6 @@ class CoilAllocation:
             axis = round(angle + HEADING_STEP * (before - after) / (before + after), 6)  # it grows alike beside
             axes.append((axis, 0.5 * (before + after) / HEADING_STEP * current))
         return tuple(axes)
-
-    def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
-        """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
-        # Most solutions are inside the bounds, where the unconstrained one is optimal.
-        found: Vector = np.linalg.lstsq(system, target, rcond=None)[0].astype(np.float64, copy=False)
-        if ((found >= lower) & (found <= upper)).all():
-            return found
-        # The solver rejects equal bounds; the small gap has no effect.
-        bounds = (lower, np.maximum(upper, lower + 1e-9))
-        return np.clip(self._solve_bounded(system, target, bounds=bounds, method="bvls").x, lower, upper)
 
 
 class CertifiedAllocation:

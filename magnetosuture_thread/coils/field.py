@@ -160,14 +160,16 @@ class LoopCoils:
 
     Attributes:
         names: of the coils, in the order of their currents.
+        axes: unit vectors to them, shape (2, m).
+        numbers: their distance, radius and field, see `fields_per_current`, shape (3, m).
     """
 
     def __init__(self, coils: Sequence[CoilProperties]) -> None:
         self.names = tuple(coil.name for coil in coils)
         angles = np.array([coil.angle for coil in coils])
-        self._axes = np.array([np.cos(angles), np.sin(angles)])
-        self._numbers = np.array([[coil.distance, coil.radius, coil.field_per_current] for coil in coils]).T.copy()
+        self.axes = np.array([np.cos(angles), np.sin(angles)])
+        self.numbers = np.array([[coil.distance, coil.radius, coil.field_per_current] for coil in coils]).T.copy()
 
     def per_current(self, point: Vector) -> NDArray[np.float64]:
         """Return the field at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
-        return np.asarray(fields_per_current(float(point[0]), float(point[1]), self._axes, self._numbers))
+        return np.asarray(fields_per_current(float(point[0]), float(point[1]), self.axes, self.numbers))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.allocation import (
     COIL_ERROR,
@@ -15,6 +16,7 @@ from magnetosuture_thread.coils.allocation import (
     CoilAllocation,
     NeedleMechanics,
     PoseDeviation,
+    bounded_least_squares,
 )
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.needle_motion import NeedleTwist
@@ -91,6 +93,25 @@ def test_saturation_is_reported_with_the_velocity_really_reached():
     assert found.saturated
     assert np.abs(found.currents).max() == pytest.approx(0.5)
     assert 0.0 < found.velocity[0] < 0.01
+
+
+@pytest.mark.parametrize("unknowns", [3, 4, 6, 8])
+def test_bounded_least_squares_are_those_of_scipy(unknowns: int):
+    rng = np.random.default_rng(unknowns)
+    at_bounds = 0
+    for number in range(100):
+        system = np.vstack([rng.normal(size=(5, unknowns)), np.diag(rng.uniform(1e-3, 1.0, unknowns))])
+        target = rng.normal(size=len(system)) * rng.choice([0.1, 1.0, 10.0])
+        lower = rng.normal(size=unknowns)
+        upper = lower + rng.uniform(0.0, 2.0, unknowns)
+        if number % 5 == 0:
+            upper[0] = lower[0]
+        found = bounded_least_squares(system, target, lower, upper)
+        expected = lsq_linear(system, target, (lower, upper + 1e-12), method="bvls", tol=1e-14).x
+        np.testing.assert_allclose(found, expected, atol=1e-7)
+        assert np.all((lower <= found) & (found <= upper))
+        at_bounds += bool(np.any((found == lower) | (found == upper)))
+    assert at_bounds > 50
 
 
 @given(
