@@ -300,8 +300,8 @@ def loop_timing(client: CoilClient) -> tuple[list[float], str]:
     """
     from magnetosuture_thread.nodes import topics
     from magnetosuture_thread.nodes.clients import Inbox
-    from magnetosuture_thread.nodes.coil_bridge import JITTER_KEYS, SCHEDULING
-    from magnetosuture_thread.nodes.node import read_status
+    from magnetosuture_thread.nodes.coil_bridge import JITTER_KEYS
+    from magnetosuture_thread.nodes.node import SCHEDULING, read_status
 
     reports = Inbox(client.node, topics.DIAGNOSTICS, 10)
 

@@ -349,10 +349,6 @@ class SimulatedHost(RecordingHost):
         missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
-            # Only now: while it compiles for the first time, others shall not wait for it.
-            # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key:
-            # so tracker and model go before the browser and the rig, and behind the bridge.
-            self.log(f"perception: {self._nodes.prefer('perception', 5)}")
             self._block("")
             self.log(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > live.START_TIMEOUT:

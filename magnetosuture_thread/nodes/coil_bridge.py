@@ -27,13 +27,11 @@ from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.pulses import PulseBridge
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
-from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings.interface import Service
 
 # Keys of the report on /diagnostics.
-SCHEDULING, PROCESS = "scheduling", "process"
+PROCESS = "process"
 JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
 AGED = (*INPUTS.values(), topics.NEEDLE_POSE.name)  # inputs whose least age is reported
 
@@ -61,6 +59,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._currents, self._setpoints = topics.CURRENTS.publisher(self), topics.NEEDLE_SETPOINT.publisher(self)
         self._states, self._filter = topics.BRIDGE_STATE.publisher(self), topics.FILTER_STATE.publisher(self)
         self._rig = topics.RIG_CURRENTS.publisher(self)
+        self.health.note(**{PROCESS: f"{socket.gethostname()} {os.getpid()}"})
         self.every(0.1, lambda: self._publish_state(force=True))
         # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
         self._log(self.system.closed, self.system.driver_state)
@@ -187,13 +186,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if self.system.latch.latched_reason and self.stage == "active":
             self._reactivate = True
             self.trigger_deactivate()
-
-    def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
-        """Do the work of this node at the real-time priority of its loop."""
-        scheduling = raise_priority((self.settings or CoilBridgeSettings()).realtime_priority)
-        self.health.note(**{SCHEDULING: scheduling, PROCESS: f"{socket.gethostname()} {os.getpid()}"})
-        self.get_logger().info(f"{SCHEDULING}: {scheduling}")
-        super().spin(executor, is_over)
 
     def refuse(self, problem: Exception) -> None:
         """Count and report a message that was refused."""

@@ -29,6 +29,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, ManagedNode, SceneFollower, check_pressed, reason_of
 from magnetosuture_thread.nodes.parameters import settings_of
+from magnetosuture_thread.nodes.processes import leave_priority
 from magnetosuture_thread.planning import session
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
@@ -51,7 +52,7 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
         super().__init__(interface.PLANNER, session.NeedlePlannerSettings, **options)
         self._coils = settings_of(self, CoilBridgeSettings, options)
         self._model = settings_of(self, ThreadModelSettings, options)
-        self._planning = ThreadPoolExecutor(1)
+        self._planning = ThreadPoolExecutor(1, initializer=leave_priority)
         self._moving = False  # whether the last command was not zero
         self._action: ProcedureAction | None = None
         self._scene = SceneFollower(self, self.on_scene)

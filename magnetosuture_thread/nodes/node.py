@@ -36,6 +36,7 @@ from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.parameters import declare, plain_value
+from magnetosuture_thread.nodes.processes import raise_priority
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError, shortened
@@ -44,6 +45,7 @@ C = TypeVar("C", bound=Configuration)
 
 PERIOD = 1.0  # s between two reports of a node
 COMPILING = "compiling"  # how the state of a node begins that does
+SCHEDULING = "scheduling"  # key of a report on /diagnostics
 MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 MAX_REQUEST_ENTRIES = 1000  # of a list in a request: each takes its time, and nothing else runs meanwhile
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -410,6 +412,13 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         Only called where some parameters are not fixed.
         """
         raise NotImplementedError
+
+    def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
+        """Do the work of this node, and of all others in its executor, at its real-time priority."""
+        scheduling = raise_priority(self.get_parameter("realtime_priority").value)
+        self.health.note(**{SCHEDULING: scheduling})
+        self.get_logger().info(f"{SCHEDULING}: {scheduling}")
+        super().spin(executor, is_over)
 
     def may_start(self) -> bool:
         """Return whether the node may become active by itself at its start."""

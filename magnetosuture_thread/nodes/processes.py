@@ -159,10 +159,6 @@ class NodeProcesses:
             options: dict[str, Any] = {"start_new_session": True, "preexec_fn": _end_with_parent}
             self._processes[name] = subprocess.Popen(command, env=self._environment, **streams, **options)
 
-    def prefer(self, name: str, priority: int) -> str:
-        """Give a node a real-time priority, where the system allows any; return how it is scheduled then."""
-        return raise_priority(priority, self._processes[name].pid)
-
     def kill(self, name: str) -> None:
         """Kill a node, as a crash would."""
         process = self._processes.pop(name)
@@ -192,15 +188,14 @@ def _end_with_parent() -> None:
     _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
 
 
-def raise_priority(priority: int, process: int | None = None) -> str:
-    """Give all threads of a process a real-time priority, and return the result as text.
+def raise_priority(priority: int) -> str:
+    """Give all threads of this process a real-time priority, and return the result as text.
 
     Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some
     milliseconds. Threads that begin later inherit the priority.
 
     Args:
         priority: of SCHED_FIFO, 1 to 99; with 0 all stays as it is.
-        process: its number; this one if None.
 
     Returns:
         How the process is scheduled now, for a person.
@@ -208,13 +203,18 @@ def raise_priority(priority: int, process: int | None = None) -> str:
     if not priority:
         return "ordinary"
     try:
-        for thread in Path(f"/proc/{process or 'self'}/task").iterdir():
+        for thread in Path("/proc/self/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except ProcessLookupError:
         pass  # a thread that has just ended
     except OSError as error:
         return f"ordinary; real-time priority {priority} refused ({error.strerror}), see `ulimit -r`"
     return f"real time, priority {priority}"
+
+
+def leave_priority() -> None:
+    """Schedule this thread as ordinary ones: a worker that takes long must not hold up what is due."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 class Interruption:

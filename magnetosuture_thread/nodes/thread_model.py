@@ -38,6 +38,7 @@ from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower
+from magnetosuture_thread.nodes.processes import leave_priority
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import to_mapping
@@ -303,7 +304,7 @@ class ThreadForecasts:
         topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state))
         topics.PROCEDURE_PLAN.subscribe(node, self.on_plan)
         node.serve(interface.Service.FORECAST_PATH, self.on_path)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="forecasts")
+        self._worker = ThreadPoolExecutor(1, "forecasts", leave_priority)
         self._error: Exception | None = None
 
     def close(self) -> None:

@@ -38,10 +38,16 @@ MAX_NEEDLE_TURN = 1.02 * math.pi  # of a needle, tail to tip [rad]; a little mor
 
 @dataclass(frozen=True)
 class LifecycleSettings(Configuration):
-    """The state that a lifecycle node enters; each node has its own value."""
+    """The state that a lifecycle node enters, and how it is scheduled; each node has its own values."""
 
     autostart: str = quantity(
         "active", "state that the node enters by itself at start", choices=("unconfigured", "inactive", "active")
+    )
+    realtime_priority: int = quantity(
+        5,
+        "real-time priority of the process, where permitted, below that of the coil bridge; 0 for none",
+        minimum=0,
+        maximum=99,
     )
 
 

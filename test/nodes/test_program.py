@@ -188,3 +188,18 @@ def test_nothing_leads_the_graph_out_of_this_machine(monkeypatch: pytest.MonkeyP
     assert "ROS_DISCOVERY_SERVER" not in environment
     assert environment["ROS_DOMAIN_ID"] == "7"
     assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+
+
+def test_a_process_gets_its_priority_as_far_as_permitted_and_its_workers_are_ordinary():
+    code = """
+import os
+from concurrent.futures import ThreadPoolExecutor
+from magnetosuture_thread.nodes.processes import leave_priority, raise_priority
+said = raise_priority(5)
+assert said == {os.SCHED_FIFO: "real time, priority 5"}.get(os.sched_getscheduler(0), said), said
+assert os.sched_getscheduler(0) == os.SCHED_FIFO or "priority 5 refused" in said, said
+with ThreadPoolExecutor(1, initializer=leave_priority) as workers:
+    assert workers.submit(os.sched_getscheduler, 0).result() == os.SCHED_OTHER
+assert raise_priority(0) == "ordinary"
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
