@@ -40,15 +40,15 @@ def finite_array(name: str, value: Any, shape: tuple[int | None, ...], limits: Q
     Raises:
         InvalidInputError: something is not a number, not finite or out of the limits, or the shape is another.
     """
-    array, words = as_numbers(name, value), str(shape).replace("None", "m")
+    array = as_numbers(name, value)
     if array.ndim != len(shape) or any(size not in (None, got) for size, got in zip(shape, array.shape, strict=True)):
-        raise InvalidInputError(name, f"shape {array.shape}", f"shape {words}")
+        raise InvalidInputError(name, f"shape {array.shape}", f"shape {str(shape).replace('None', 'm')}")
     # Of a few numbers numpy takes longer to find the greatest.
     few = array.shape in ((2,), (3,))
     extremes = array.tolist() if few else [float(array.min(initial=0.0)), float(array.max(initial=0.0))]
-    if not all(map(limits.within, extremes)):
+    if not all(math.isfinite(number) and limits.minimum <= number <= limits.maximum for number in extremes):
         expected = limits.expectation(tuple, extremes).replace("a list", "numbers")
-        raise InvalidInputError(name, extremes, f"finite {expected}, in shape {words}")
+        raise InvalidInputError(name, extremes, f"finite {expected}, in shape {str(shape).replace('None', 'm')}")
     return array
 
 
