@@ -212,33 +212,52 @@ def response(data: AllocationData, field: float) -> float:
 
 
 @compiled
-def least_squares(system: Vector, target: Vector, free: NDArray[np.bool_], found: Vector) -> None:
-    """Write the x of least |system x - target| into `found` where x is free; elsewhere it stays.
+def dot(first: Vector, second: Vector, begin: int) -> float:
+    """Return the product of two vectors from an element on."""
+    total = 0.0
+    for k in range(begin, len(first)):
+        total += first[k] * second[k]
+    return total
 
-    By Householder's reflections of the columns that are free (Golub and Van Loan, Matrix Computations, algorithm
-    5.3.2). These must be independent.
+
+@compiled
+def least_squares(system: Vector, target: Vector, free: NDArray[np.bool_], x: Vector) -> None:
+    """Make |system x - target| least by those elements of x that are free.
+
+    By Householder's reflections of their columns, which must be independent. Source: Golub and Van Loan, Matrix
+    Computations, algorithm 5.3.2. Deviation: none.
 
     Args:
         system: shape (k, m).
         target: shape (k,).
         free: shape (m,).
-        found: x, shape (m,).
+        x: shape (m,), changed.
     """
-    columns = np.flatnonzero(free)
-    rest, matrix = target - system @ np.where(free, 0.0, found), system[:, columns]
-    for j in range(len(columns)):
-        size = math.sqrt(np.sum(matrix[j:, j] ** 2))
-        v = matrix[j:, j].copy()
-        v[0] += math.copysign(size, v[0])
-        scale = 2.0 / np.sum(v * v)
-        for k in range(j, len(columns)):
-            matrix[j:, k] -= scale * np.sum(v * matrix[j:, k]) * v
-        rest[j:] -= scale * np.sum(v * rest[j:]) * v
-    for j in range(len(columns) - 1, -1, -1):
-        for k in range(j + 1, len(columns)):
-            rest[j] -= matrix[j, k] * rest[k]
-        rest[j] /= matrix[j, j]
-        found[columns[j]] = rest[j]
+    count, rows = 0, len(target)
+    rest, columns, diagonal = target.copy(), np.empty((len(x), rows)), np.empty(len(x))
+    for j in range(len(x)):
+        for i in range(rows):
+            columns[count, i] = system[i, j]
+            if not free[j]:
+                rest[i] -= system[i, j] * x[j]
+        count += free[j]
+    for j in range(count):
+        v = columns[j]
+        square = dot(v, v, j)
+        diagonal[j] = -math.copysign(math.sqrt(square), v[j])
+        scale = 1.0 / (square - diagonal[j] * v[j])
+        v[j] -= diagonal[j]
+        for k in range(j + 1, count + 1):
+            reflected = columns[k] if k < count else rest
+            part = scale * dot(v, reflected, j)
+            for i in range(j, rows):
+                reflected[i] -= part * v[i]
+    for m in range(len(x) - 1, -1, -1):
+        if free[m]:
+            count -= 1
+            x[m] = rest[count] / diagonal[count]
+            for i in range(count):
+                rest[i] -= columns[count, i] * x[m]
 
 
 @compiled
@@ -247,7 +266,7 @@ def bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: 
 
     Source: Stark and Parker, Bounded-variable least squares, Computational Statistics 10, 1995: unknowns are fixed at a
     bound that stops the way to the solution without them, and freed where the residual decreases off it. Deviation:
-    begins at the unbounded solution, within bounds; most often that is the solution.
+    begins at the unbounded solution, brought within bounds; most often that is the solution.
 
     Args:
         system: of full rank, shape (k, m).
@@ -255,36 +274,41 @@ def bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: 
         lower: bounds, shape (m,).
         upper: at least as great, shape (m,).
     """
-    free = np.ones(len(lower), np.bool_)
-    x = np.zeros(len(lower))
+    count, free = len(lower), np.ones(len(lower), np.bool_)
+    x = np.zeros(count)
     least_squares(system, target, free, x)
-    if np.all(x >= lower) and np.all(x <= upper):
+    for k in range(count):
+        free[k] = lower[k] < x[k] < upper[k]
+        x[k] = min(max(x[k], lower[k]), upper[k])
+    if free.all():
         return x
-    free = (x > lower) & (x < upper)
-    x = np.minimum(np.maximum(x, lower), upper)
     for _ in range(MAX_EXCHANGES):
-        aim = x.copy()
+        aim, part, stop = x.copy(), 1.0, -1
         least_squares(system, target, free, aim)
-        part, stop = 1.0, -1
-        for k in range(len(x)):
-            bound = upper[k] if aim[k] > x[k] else lower[k]
-            if free[k] and (aim[k] - bound) * (aim[k] - x[k]) > 0.0 and (bound - x[k]) / (aim[k] - x[k]) < part:
-                part, stop = (bound - x[k]) / (aim[k] - x[k]), k
-        x += part * (aim - x)
+        for k in range(count):
+            step = aim[k] - x[k]
+            room = (upper[k] if step > 0.0 else lower[k]) - x[k]
+            if free[k] and abs(step) * part > abs(room):
+                part, stop = room / step, k
+        for k in range(count):
+            x[k] += part * (aim[k] - x[k])
         if stop >= 0:
             free[stop] = False
             x[stop] = upper[stop] if aim[stop] > x[stop] else lower[stop]
             continue
-        gain = system.T @ (target - system @ x)
-        worst, best = -1, 0.0
-        for k in range(len(x)):
+        gain, worst, best = np.zeros(count), -1, 0.0
+        for i in range(len(target)):
+            residual = target[i] - dot(system[i], x, 0)
+            for k in range(count):
+                gain[k] += system[i, k] * residual
+        for k in range(count):
             inward = gain[k] if x[k] == lower[k] else -gain[k]
             if not free[k] and lower[k] < upper[k] and inward > best:
                 worst, best = k, inward
         if worst < 0:
             break
         free[worst] = True
-    return np.minimum(np.maximum(x, lower), upper)
+    return x
 
 
 @compiled
@@ -299,10 +323,10 @@ def allocate_currents(data: AllocationData, request: Request, x: float, y: float
     # From the field at one pole alone: velocities count by the force that they take.
     along_speed, across_speed = data.along * data.field, data.across * data.field
     system, target = np.zeros((5 + count, count)), np.zeros(5 + count)
-    misaligned, bend = np.zeros(count), request.place / PLACE_STEP * (beside[2] - rows[2])
+    misaligned, bend = np.zeros(count), np.empty(count)
     for k in range(count):
+        bend[k] = request.place / PLACE_STEP * (beside[2, k] - rows[2, k])
         system[0, k], system[3, k] = rows[0, k] / along_speed, rows[1, k] / across_speed
-        system[2, k] = ALIGN_WEIGHT / data.field * rows[3, k]
         system[5 + k, k] = CURRENT_WEIGHT / data.max_current
         if not request.at_tip:  # else a drift by such an error is corrected by the turn, as any other
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
@@ -311,15 +335,16 @@ def allocate_currents(data: AllocationData, request: Request, x: float, y: float
             drift = COIL_ERROR / across_speed * math.hypot(rows[1, k], swung)
             system[5 + k, k] = math.hypot(system[5 + k, k], drift)
             misaligned[k] = (turned[1, k] - rows[1, k]) / (HEADING_STEP * across_speed)
-    target[0], target[2], target[3] = request.along / along_speed, ALIGN_WEIGHT, request.across / across_speed
+    target[0], target[3] = request.along / along_speed, request.across / across_speed
     measured = HEADING_ERROR**2 + (request.turn_rate * request.stamp) ** 2
     currents, field, doubt = request.previous, data.field, math.sqrt(measured)
     for number in range(FIELD_ROUNDS + 1):
         before, last = field, doubt
-        if number or np.any(currents != 0.0):  # from which what is looked for is not far
-            field = max(np.sum(rows[3] * currents), least)
-            bent, error = np.sum(bend * currents), COIL_ERROR**2 * np.sum((rows[2] * currents) ** 2)
-            doubt = math.sqrt(measured + (bent**2 + error) / field**2)
+        if number or currents.any():  # from which what is looked for is not far
+            field, error = max(dot(rows[3], currents, 0), least), dot(bend, currents, 0) ** 2
+            for k in range(count):
+                error += (COIL_ERROR * rows[2, k] * currents[k]) ** 2
+            doubt = math.sqrt(measured + error / field**2)
         if number:
             doubt = math.sqrt(last * doubt)
             is_known = abs(field - before) <= FIELD_TOLERANCE * before and abs(doubt - last) <= FIELD_TOLERANCE * last
@@ -330,17 +355,18 @@ def allocate_currents(data: AllocationData, request: Request, x: float, y: float
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * field / resistance
         speed = lever * request.turn_rate + lever / resistance * request.balance
         weight = TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
-        system[1] = weight * lever / resistance * rows[2]
-        if request.at_tip:
-            system[1] += weight * rows[1]
         target[1] = weight * min(max_turn_speed, max(-max_turn_speed, speed))
-        system[2], target[2] = ALIGN_WEIGHT / data.field * rows[3], ALIGN_WEIGHT
-        system[4] = doubt * misaligned
-        currents = bounded_least_squares(system, target, request.lower, request.upper)
-        if np.sum(rows[3] * currents) < least:
-            # A constraint that the optimum violates is active in the constrained optimum.
-            system[2], target[2] = CONSTRAINT_WEIGHT / data.field * rows[3], CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
+        for k in range(count):
+            system[1, k] = weight * (lever / resistance * rows[2, k] + (rows[1, k] if request.at_tip else 0.0))
+            system[4, k] = doubt * misaligned[k]
+        # A constraint that the optimum violates is active in the constrained optimum.
+        for align, share in ((ALIGN_WEIGHT, 1.0), (CONSTRAINT_WEIGHT, MIN_ALIGNING_SHARE)):
+            target[2] = align * share
+            for k in range(count):
+                system[2, k] = align / data.field * rows[3, k]
             currents = bounded_least_squares(system, target, request.lower, request.upper)
+            if dot(rows[3], currents, 0) >= least:
+                break
     return currents
 
 
