@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Set
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -249,22 +250,23 @@ class HiddenShares:
     """Hidden shares of thread and time. Each frame counts for the time until the next one.
 
     Attributes:
-        time: share of the time in which a part of the thread was hidden: more than 3 % of its length.
-        all_time: share of the time in which all of it was: the estimate is a prediction only.
-        length: part of the length that was hidden, mean over the time.
+        hidden_time_share: of the time, with a part of the thread hidden: more than 3 % of its length; None without
+            estimates, as the others.
+        all_hidden_time_share: of the time, with all of it hidden: the estimate is a prediction only.
+        hidden_length_share: part of the length that was hidden, mean over the time.
     """
 
-    time: float
-    all_time: float
-    length: float
+    hidden_time_share: float | None = None
+    all_hidden_time_share: float | None = None
+    hidden_length_share: float | None = None
 
     @classmethod
-    def of(cls, series: TimeSeries) -> HiddenShares | None:
-        """Return the shares; None if no frame has an estimate."""
+    def of(cls, series: TimeSeries) -> HiddenShares:
+        """Return the shares."""
         hidden, corrected = series.column("hidden"), series.column("corrected")
         known = np.isfinite(hidden) & np.isfinite(corrected)
         if not known.any():
-            return None
+            return cls()
         steps = np.diff(series.times)
         usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
         durations = np.append(steps, usual)  # the usual interval for the last one, and before a gap
@@ -293,30 +295,34 @@ class Consistency:
     filter knows how wrong it is; one above the band that it trusts itself too much.
 
     Attributes:
-        width: of each window [s].
+        normalised_innovation_squared_mean: of all; None if no measurement went into an estimate, as the other figures.
+        band_95_low: of a usual window: the median of all lower ends.
+        band_95_high: the same of the upper ends.
+        window_s: width of each window [s].
+        windows: number of windows in which anything was measured.
+        windows_within_band: number of windows whose mean is within its band.
+        windows_within_band_share: of those in which anything was measured.
         means: of the normalised innovations squared, shape (k,); nan where nothing was measured.
         high: upper end of the band of each, shape (k,).
-        mean: of all normalised innovations squared.
-        windows: number of windows in which anything was measured.
-        within: number of windows whose mean is within its band.
-        band: of a usual window: the median of both ends.
     """
 
-    width: float
-    means: Array
-    high: Array
-    mean: float
-    windows: int
-    within: int
-    band: tuple[float, float]
+    normalised_innovation_squared_mean: float | None = None
+    band_95_low: float | None = None
+    band_95_high: float | None = None
+    window_s: float | None = None
+    windows: int = 0
+    windows_within_band: int = 0
+    windows_within_band_share: float | None = None
+    means: Array = field(default_factory=partial(np.empty, 0))
+    high: Array = field(default_factory=partial(np.empty, 0))
 
     @classmethod
-    def of(cls, series: TimeSeries) -> Consistency | None:
-        """Return the consistency of a run; None if no measurement went into an estimate."""
+    def of(cls, series: TimeSeries) -> Consistency:
+        """Return the consistency of a run."""
         table = np.array([series.times, series.column("innovation_squared"), series.column("innovations")])
         times, squared, counts = table[:, np.isfinite(table[1])]
         if not len(times):
-            return None
+            return cls()
         first, last = float(times.min()), float(times.max())
         windows = max(1, math.floor((last - first) / 4.95))
         width = max((last - first) / windows, 1e-3)
@@ -324,9 +330,9 @@ class Consistency:
         count = np.bincount(index, counts, windows).astype(np.float64)
         count[count == 0.0] = np.nan
         means, (low, high) = np.bincount(index, squared * counts, windows) / count, mean_band(count)
-        within, band = int(((low <= means) & (means <= high)).sum()), (np.nanmedian(low), np.nanmedian(high))
-        mean = float((squared * counts).sum() / counts.sum())
-        return cls(width, means, high, mean, int(np.isfinite(means).sum()), within, (float(band[0]), float(band[1])))
+        band, mean = np.nanmedian([low, high], axis=1).tolist(), float((squared * counts).sum() / counts.sum())
+        known, within = int(np.isfinite(means).sum()), int(((low <= means) & (means <= high)).sum())
+        return cls(mean, band[0], band[1], width, known, within, within / known, means, high)
 
 
 @dataclass(frozen=True)
@@ -384,36 +390,21 @@ class EstimationFigures:
 
     Attributes:
         corrected: number of frames whose estimate took a measurement; of the others it is a prediction only.
-        consistency: of the innovations; None where no measurement went in.
-        hidden: how much of the thread was hidden; None where nothing was estimated.
+        consistency: of the innovations.
+        hidden: how much of the thread was hidden.
         disturbances: what the model does not know, by its beginning.
     """
 
     corrected: int = 0
-    consistency: Consistency | None = None
-    hidden: HiddenShares | None = None
+    consistency: Consistency = field(default_factory=Consistency)
+    hidden: HiddenShares = field(default_factory=HiddenShares)
     disturbances: tuple[DisturbanceEvent, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none."""
-        hidden, consistency = self.hidden, self.consistency
-        windows = {
-            "normalised_innovation_squared_mean": consistency.mean if consistency else None,
-            "band_95_low": consistency.band[0] if consistency else None,
-            "band_95_high": consistency.band[1] if consistency else None,
-            "window_s": consistency.width if consistency else None,
-            "windows": consistency.windows if consistency else 0,
-            "windows_within_band": consistency.within if consistency else 0,
-            "windows_within_band_share": consistency.within / consistency.windows if consistency else None,
-        }
-        return {
-            "corrected_frames": self.corrected,
-            "consistency": windows,
-            "hidden_time_share": hidden.time if hidden else None,
-            "all_hidden_time_share": hidden.all_time if hidden else None,
-            "hidden_length_share": hidden.length if hidden else None,
-            "disturbances": len(self.disturbances),
-        }
+        consistency = {name: part for name, part in vars(self.consistency).items() if name not in ("means", "high")}
+        figures = {"corrected_frames": self.corrected, "consistency": consistency, **vars(self.hidden)}
+        return figures | {"disturbances": len(self.disturbances)}
 
 
 class RunMetrics:
@@ -445,7 +436,7 @@ class RunMetrics:
         self.length, self._start = length, start
         self._disturbed_since = math.nan
         self._minimum: dict[str, MinimumMargin] = {}
-        self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
+        self._maps = {target: ErrorMap(length) for target in self.targets}
         self._worst: dict[str, WorstFrame] = {}
 
     @classmethod
@@ -525,7 +516,8 @@ class RunMetrics:
                 if not np.isfinite(there).all():
                     continue  # a prediction with a node that is nowhere
                 row[column], row[f"max_node_{column}"] = float(there.mean()), float(there.max())
-                self._maps[kind, target].add(time, errors)
+                if kind == "prediction":
+                    self._maps[target].add(time, errors)
             error = frame.errors[target] = row.get(f"error_{target}", math.nan)
             if error > (self._worst[target].error if target in self._worst else -1.0):
                 self._worst[target] = WorstFrame(time, error, frame)
@@ -544,9 +536,10 @@ class RunMetrics:
         """Target of error map and worst frames: the truth where there is any; empty for none."""
         return next((target for target in self.targets if len(self.series.known(f"error_{target}"))), "")
 
-    def error_map(self, kind: str = "prediction") -> ErrorMap | None:
-        """Return the map of the error along the thread, of `prediction` or `estimate`."""
-        return self._maps.get((kind, self.target))
+    @property
+    def error_map(self) -> ErrorMap | None:
+        """Map of the prediction's error along the thread."""
+        return self._maps.get(self.target)
 
     @property
     def worst(self) -> WorstFrame | None:

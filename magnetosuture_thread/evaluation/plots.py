@@ -202,8 +202,7 @@ def _draw_along(axes: Axes, bar: Axes, metrics: RunMetrics) -> None:
     """Draw the error of the prediction along the thread over time."""
     distance = f"distance of the prediction from {AGAINST.get(metrics.target, 'nothing that is known')}"
     _title(axes, f"{distance} [% of the length], by arc length from the needle's tail [mm]")
-    errors = metrics.error_map()
-    grid = errors.grid() if errors is not None else None
+    grid = metrics.error_map.grid() if metrics.error_map is not None else None
     if grid is None or grid[2].shape[1] < 2:
         bar.set_axis_off()
         return

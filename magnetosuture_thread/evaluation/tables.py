@@ -458,15 +458,14 @@ def summary_table(summary: ReplaySummary) -> Table:
         pull = f"{1e6 * summary.needle_pull:.3g} µN on the needle"
         lines["peak tension"] = f"{1e6 * summary.peak_tension:.3g} µN, {pull}"
     lines |= _errors(summary)
-    estimation = summary.estimation
-    if estimation.hidden is not None:
-        lines["thread hidden"] = f"{100.0 * estimation.hidden.time:.1f} % of the time, in part or all"
-        lines["disturbances"] = str(len(estimation.disturbances))
+    if (hidden := summary.estimation.hidden.hidden_time_share) is not None:
+        lines["thread hidden"] = f"{100.0 * hidden:.1f} % of the time, in part or all"
+        lines["disturbances"] = str(len(summary.estimation.disturbances))
         lines["squared innovation, mean"] = "none, the estimate is a prediction only"
-    if (consistency := estimation.consistency) is not None:
-        band = f"in {consistency.band[0]:.2f} to {consistency.band[1]:.2f} in {consistency.within} of"
-        windows = f"{consistency.windows} windows of {consistency.width:.1f} s"
-        lines["squared innovation, mean"] = f"{consistency.mean:.3f}; {band} {windows}"
+    if (found := summary.estimation.consistency).windows:
+        band = f"in {found.band_95_low:.2f} to {found.band_95_high:.2f} in {found.windows_within_band} of"
+        windows = f"{found.windows} windows of {found.window_s:.1f} s"
+        lines["squared innovation, mean"] = f"{found.normalised_innovation_squared_mean:.3f}; {band} {windows}"
     if (apart := summary.currents) is not None:
         median = f"{apart.difference:.3f} A median of {apart.recorded:.2f} A rms; maximum {apart.greatest:.2f} A"
         stopped = f"{100.0 * apart.stopped_apart:.1f} % of {apart.compared} stopped in one only"

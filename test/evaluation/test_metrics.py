@@ -112,14 +112,13 @@ def test_innovations_are_within_their_band_if_they_are_as_expected(scale: float)
     for k, row in enumerate(squared):
         run.add(frame(0.1 * k, EstimatedThread(STRAIGHT, True, row)))
     found = metrics.Consistency.of(run.series)
-    assert found is not None
     assert found.windows == 40
-    assert found.width == pytest.approx(199.9 / 40)
-    assert found.mean == pytest.approx(np.nanmean(squared), rel=1e-9)
+    assert found.window_s == pytest.approx(199.9 / 40)
+    assert found.normalised_innovation_squared_mean == pytest.approx(np.nanmean(squared), rel=1e-9)
     if scale == 1.0:
-        assert found.within >= 34
+        assert found.windows_within_band >= 34
     else:
-        assert found.within == 0
+        assert found.windows_within_band == 0
         assert (found.means > found.high).all()
     counts = np.array([16.0, 2400.0])
     for count, low, high in zip(counts, *metrics.mean_band(counts), strict=True):
@@ -131,8 +130,8 @@ def test_hidden_shares_are_of_time_and_not_of_frames():
     for time in [*np.arange(0.0, 1.0, 0.1), *np.arange(1.0, 2.0, 0.05)]:
         run.add(frame(time, EstimatedThread(STRAIGHT, time < 1.5), measured=LINE[:5] if time < 1.0 else LINE))
     found = metrics.HiddenShares.of(run.series)
-    assert found is not None
-    assert (found.time, found.all_time, found.length) == pytest.approx((0.75, 0.25, 0.5), abs=0.02)
+    shares = found.hidden_time_share, found.all_hidden_time_share, found.hidden_length_share
+    assert shares == pytest.approx((0.75, 0.25, 0.5), abs=0.02)
 
 
 def test_disturbances_of_one_beginning_are_one_event():
