@@ -73,8 +73,7 @@ def pack(layout: str, *values: Any) -> bytes:
             spaces. `header` is a stamp in the dish frame, `needle_header` one in the needle's, and `time` a stamp, all
             of type `Stamp`; `text` is a string; numbers have their names in ROS. `float64[]` is a sequence of numbers,
             `float64[9]` an array, whose numbers stand without a count; `points` is an array of shape (m, 2) as a
-            sequence of points or vectors with z = 0; `texts` is a sequence of strings; `raw` is bytes that are in place
-            as they are.
+            sequence of points or vectors with z = 0; `texts` is a sequence of strings.
         values: of the fields.
     """
     data = bytearray(BEGIN)
@@ -92,8 +91,6 @@ def pack(layout: str, *values: Any) -> bytes:
             data += bytes(-len(data) % 4) + _COUNT.pack(len(value))
             for text in value:
                 _put_text(data, text)
-        elif kind == "raw":
-            data += value
         else:
             _put_numbers(data, kind, number, value)
     return bytes(data)
@@ -127,11 +124,6 @@ def _put_numbers(data: bytearray, kind: str, dtype: np.dtype[Any], values: Array
         data += bytes((4 - len(data)) % dtype.itemsize) + numbers.tobytes()
 
 
-def aligned(at: int, to: int) -> int:
-    """Return the next place of a size, which counts from behind the first four bytes."""
-    return 4 + (at - 4 + to - 1) // to * to
-
-
 def packed_header(stamp: Stamp) -> bytes:
     """Return a Header in the dish frame."""
     return pack("header", stamp)
@@ -163,29 +155,27 @@ def packed_pose_stamped(stamp: Stamp, point: Vector, angle: float) -> bytes:
     return pack("header float64[7]", stamp, planar_pose_fields(point, angle))
 
 
-PATH_AT = aligned(DISH_END, 4) + 4  # where the poses of a path begin, behind their count
-_POSITION_AT = aligned(DISH_END, 8) - len(BEGIN)  # in a pose that begins at a multiple of 8
-PATH_POSES = np.dtype(  # all but the first begin there
-    {
-        "names": ["time", "frame", "x", "y", "z", "w"],  # z and w of the quaternion
-        "formats": ["V8", f"V{DISH_END - len(BEGIN) - 8}", "<f8", "<f8", "<f8", "<f8"],
-        "offsets": [0, 8, *(_POSITION_AT + np.array([0, 8, 40, 48])).tolist()],
-        "itemsize": _POSITION_AT + 56,
-    }
-)
-PATH_GAP = aligned(PATH_AT, 8) - PATH_AT  # bytes more before the first position, by the length of the frame's name
+PATH_BYTES, POSE_BYTES = len(pack("header uint32", 0, 0)), len(pack("header float64[7]", 0, np.zeros(7))) - len(BEGIN)
+NUMBERS_BYTES = 7 * 8  # of a pose, at its end
 
 
 def packed_path(stamp: Stamp, points: Points) -> bytes:
     """Return a polyline of shape (m, 2) [m], or x, y [m] and angle [rad] of poses, shape (m, 3), as a Path."""
-    poses = np.zeros(len(points), PATH_POSES)
-    header = packed_header(stamp)[len(BEGIN) :]
-    poses["time"], poses["frame"] = np.void(header[:8]), np.void(header[8:])
+    poses = np.zeros((len(points), 7))
     half = 0.5 * points[:, 2] if points.shape[1:] == (3,) else np.zeros(len(points))
-    poses["x"], poses["y"], poses["z"], poses["w"] = points[:, 0], points[:, 1], np.sin(half), np.cos(half)
-    data = poses.tobytes()
-    data = data[:_POSITION_AT] + bytes(PATH_GAP if len(points) else 0) + data[_POSITION_AT:]
-    return pack("header uint32 raw", stamp, len(points), data)
+    poses[:, :2], poses[:, 5], poses[:, 6] = points[:, :2], np.sin(half), np.cos(half)
+    return packed_poses(stamp, poses)
+
+
+def packed_poses(stamp: Stamp, poses: Vector) -> bytes:
+    """Return positions [m] and quaternions, shape (m, 7), as a Path."""
+    if not len(poses):
+        return pack("header uint32", stamp, 0)
+    head = pack("header uint32 header float64[7]", stamp, len(poses), stamp, poses[0])
+    pose = pack("header float64[7]", stamp, poses[0])  # as all but the first lie: from a multiple of 8 to another
+    rest = np.tile(np.frombuffer(pose, np.uint8, offset=len(BEGIN)), (len(poses) - 1, 1))
+    rest[:, -NUMBERS_BYTES:] = np.ascontiguousarray(poses[1:], np.float64).view(np.uint8)
+    return head + rest.tobytes()
 
 
 def packed_point(stamp: Stamp, point: Vector) -> bytes:

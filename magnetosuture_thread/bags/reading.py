@@ -398,16 +398,13 @@ def read_observation(record: RecordedMessage) -> ThreadObservation:
 
 
 def _plain_path(data: bytes) -> Points | None:
-    """Return a path whose poses all are in the dish frame, as ours are, so that they lie at equal distances."""
-    if packing.PATH_GAP or not is_in_dish_frame(data) or len(data) < packing.PATH_AT:
+    """Return a path whose bytes are those that `packing.packed_poses` gives, as ours are; None of another."""
+    stamp, count = header_stamp(data), round((len(data) - packing.PATH_BYTES) / packing.POSE_BYTES)
+    if stamp is None or count < 1:
         return None
-    (count,) = struct.unpack_from("<I", data, packing.PATH_AT - 4)
-    if len(data) < packing.PATH_AT + count * packing.PATH_POSES.itemsize:
-        return None
-    poses = np.frombuffer(data, packing.PATH_POSES, count, packing.PATH_AT)
-    if poses["frame"].tobytes() != data[len(packing.BEGIN) + 8 : packing.DISH_END] * count:
-        return None
-    return np.column_stack([poses["x"], poses["y"]])
+    begin = len(data) - (count - 1) * packing.POSE_BYTES - packing.NUMBERS_BYTES
+    poses = np.ndarray((count, 7), np.float64, data, begin, (packing.POSE_BYTES, 8))
+    return poses[:, :2].copy() if packing.packed_poses(stamp, poses) == data else None
 
 
 def parse_scene_message(message: Any) -> scenes.Scene:

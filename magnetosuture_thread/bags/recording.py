@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import MarkerType, pack
+from magnetosuture_thread.bags.packing import MarkerType, pack, packed_poses
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import is_in_dish_frame, nanoseconds, stamp_and_frame
 from magnetosuture_thread.bags.storage import CDR, MAX_SILENCE
@@ -380,9 +380,7 @@ def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -
             vectors = vectors @ matrix[:3, :3].T
         return pack("header float64[6]", stamp, vectors)
     if type_name == PATH:
-        poses = _moved(_PATHS[message.__msgtype__](message), matrix)
-        fields = [field for pose in poses for field in (stamp, pose)]
-        return pack("header uint32" + " header float64[7]" * len(poses), stamp, len(poses), *fields)
+        return packed_poses(stamp, _moved(_PATHS[message.__msgtype__](message), matrix))
     (pose,) = _moved([_needle_pose(message)], matrix)
     if type_name == POSE:
         return pack("header float64[7]", stamp, pose)
