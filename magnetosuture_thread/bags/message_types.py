@@ -100,26 +100,6 @@ class MessageDecoder:
         return self.type_name == header or (bool(fields) and fields[0][1][1] == header)
 
 
-class DecoderCache:
-    """Decoders of the messages of one bag.
-
-    Those of another bag are not shared: whether a definition is still parsed depends on those before it.
-
-    Args:
-        budget: of the bag.
-    """
-
-    def __init__(self, budget: Budget) -> None:
-        self._budget = budget
-        self._decoders: dict[MessageDefinition, MessageDecoder] = {}
-
-    def decoder_of(self, definition: MessageDefinition) -> MessageDecoder:
-        """Return the decoder of messages of a definition."""
-        if definition not in self._decoders:
-            self._decoders[definition] = MessageDecoder(definition, self._budget)
-        return self._decoders[definition]
-
-
 class _Bounded(Parser):
     """A parser that ends after a number of steps: some texts make it try every way to read them."""
 

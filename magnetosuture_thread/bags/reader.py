@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
 from dataclasses import astuple, dataclass, field
 from difflib import get_close_matches
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,7 +17,7 @@ import zstandard
 
 from magnetosuture_thread.bags import absolute_topic, storage
 from magnetosuture_thread.bags.mcap import McapFile
-from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
+from magnetosuture_thread.bags.message_types import MessageDecoder
 from magnetosuture_thread.bags.storage import CDR, Budget, Connection, CorruptRegion, DamageReport, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
@@ -160,7 +161,15 @@ def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
 
 Progress = Callable[[float], None]
 BagFile = McapFile | SqliteFile
-_OWN_DECODERS = DecoderCache(Budget("messages", 0))  # of messages of no bag
+DecoderOf = Callable[[MessageDefinition], MessageDecoder]
+
+
+def _decoders(budget: Budget) -> DecoderOf:
+    """Return what gives the decoder of a definition, which is parsed once.
+
+    Bags do not share it: whether a definition is still parsed depends on those before it.
+    """
+    return cache(partial(MessageDecoder, budget=budget))
 
 
 @dataclass(slots=True)  # not frozen, which would make creating one four times as slow
@@ -173,7 +182,7 @@ class RecordedMessage:
         time: when it was recorded [ns].
         data: CDR bytes.
         definition: of its type in the bag; ours if None.
-        decoders: of the bag; None for a message of no bag.
+        decoder_of: gives the bag's decoder of a definition.
     """
 
     topic: str
@@ -181,12 +190,12 @@ class RecordedMessage:
     time: int
     data: bytes
     definition: MessageDefinition | None = field(default=None, repr=False, compare=False)
-    decoders: DecoderCache | None = field(default=None, repr=False, compare=False)
+    decoder_of: DecoderOf = field(default=_decoders(Budget("messages", 0)), repr=False, compare=False)
 
     @property
     def decoder(self) -> MessageDecoder:
         """Decoder of messages of this type."""
-        return (self.decoders or _OWN_DECODERS).decoder_of(self.definition or MessageDefinition(self.type_name))
+        return self.decoder_of(self.definition or MessageDefinition(self.type_name))
 
     def decode(self) -> Any:
         """Return the message as an object of a type store.
@@ -224,7 +233,6 @@ class Bag:
             An earlier version salvaged such bags from damaged ones without checksums; their notes say so for good.
         remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
-        decoders: of its messages; all its definitions are parsed within one budget.
         others: number of records that are neither messages nor ours, by kind.
         custom_data: entries of others in its metadata.yaml.
 
@@ -238,7 +246,7 @@ class Bag:
         self.path = path
         files = storage.find_bag_files(path)
         budget = Budget(path, sum(_file_size(file) for file in files.files))
-        self.decoders = DecoderCache(budget)
+        self._decoder_of = _decoders(budget)
         self._files, problems = _open(files.files, budget, progress)
         lost = [DamageReport((region,), 0, region.end, None) for region in (*files.lost, *problems)]
         self.damage = storage.merge_reports([*(file.damage for file in self._files), *lost])
@@ -351,7 +359,7 @@ class Bag:
                 raise
             refused[str(error)] += 1
             return None
-        return RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self.decoders)
+        return RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self._decoder_of)
 
     def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[storage.StoredMessage]:
         first = self.start + round(start * 1e9)

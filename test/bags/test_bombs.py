@@ -17,7 +17,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.writer import Writer
 
 from magnetosuture_thread.bags.mcap import MAGIC
-from magnetosuture_thread.bags.message_types import DecoderCache
+from magnetosuture_thread.bags.message_types import MessageDecoder
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import Budget, MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
@@ -128,7 +128,7 @@ IDL = "module nav_msgs { module msg { struct Path { %s }; }; };"
 )
 def test_a_definition_past_its_budget_says_so_when_a_message_is_decoded(text: str, problem: str):
     encoding = "ros2idl" if text.startswith("module") else "ros2msg"
-    decoder = DecoderCache(Budget("bag", 0)).decoder_of(MessageDefinition(PATH, encoding, text))
+    decoder = MessageDecoder(MessageDefinition(PATH, encoding, text), Budget("bag", 0))
     assert not decoder.is_ours
     with pytest.raises(BagError, match=problem):
         decoder.decode("/path", b"\0\1\0\0")
