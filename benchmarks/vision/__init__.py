@@ -7,7 +7,6 @@ is reversed. 20 frames of each class take ten minutes.
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from typing import Any
 
 import cv2
@@ -48,7 +47,7 @@ def run(options: argparse.Namespace, terminal: Terminal) -> tuple[dict[str, Any]
     with terminal.progress("vision") as advance:
         for number, name in enumerate(names, 1):
             frames = (frame_of(name, index, options.seed) for index in range(options.count))
-            rows.append(asdict(row_of(name, [measure(*frame) for frame in frames])))
+            rows.append(row_of(name, [measure(*frame) for frame in frames]))
             advance(number / len(names))
     title = f"on rendered frames, {options.count} of each class"
     terminal.print(_table(f"the needle {title}", NEEDLE, rows, POSES))

@@ -89,57 +89,6 @@ class Result:
         return self.found and not self.unknown and self.angle > REVERSED
 
 
-@dataclass(frozen=True)
-class Row:
-    """A class of frames. Lengths of thread are summed over all frames before they are divided.
-
-    Attributes:
-        name: of the class.
-        frames: number of them.
-        found: with a pose.
-        unknown: of these, with an unknown heading.
-        wrong: of these, tail or heading off by more than `WRONG_PX`, `WRONG_ANGLE`.
-        reversed: of these, by more than a right angle.
-        dishonest: of those found, off by more than their covariance tells.
-        tail_px: root mean square over those found and not wrong; None if there are none.
-        angle_deg: the same of the heading.
-        covered: share of the visible thread that was followed, over all frames.
-        covered_90: share of the frames with 90 % of it followed.
-        wrong_line: share of the published centreline where no thread is; None if none was published.
-        pieces: share of the visible thread that lies on pieces, over all frames.
-        wrong_pieces: share of the pieces' length where no thread is; None without pieces.
-        misplaced: number of pieces whose place along the thread is said to be known and is wrong.
-        complete: frames of which is said that they show all of the thread.
-        incomplete: of these, that don't.
-        free: ends of which is said that they are the thread's.
-        not_free: of these, that are not.
-        normalised: root mean square of points' distances from the thread over their standard deviation; 1 is honest.
-        median_ms: CPU time of a frame.
-    """
-
-    name: str
-    frames: int
-    found: int
-    unknown: int
-    wrong: int
-    reversed: int
-    dishonest: int
-    tail_px: float | None
-    angle_deg: float | None
-    covered: float
-    covered_90: float
-    wrong_line: float | None
-    pieces: float
-    wrong_pieces: float | None
-    misplaced: int
-    complete: int
-    incomplete: int
-    free: int
-    not_free: int
-    normalised: float | None
-    median_ms: float
-
-
 def frame_of(name: str, index: int, seed: int) -> tuple[Case, Image]:
     """Return the frame of a class with a number, the same whichever others are drawn."""
     own = [seed, zlib.crc32(name.encode()), index]
@@ -240,8 +189,23 @@ def _share(points: Points, line: Points, bound: float) -> float:
     return float(np.mean(np.asarray(KDTree(line).query(points)[0]) < bound)) if len(points) else 0.0
 
 
-def row_of(name: str, results: Iterable[Result]) -> Row:
-    """Sum up the results of a class."""
+def row_of(name: str, results: Iterable[Result]) -> dict[str, Any]:
+    """Sum up the results of a class; lengths of thread are summed over all frames before they are divided.
+
+    Returns:
+        `name` of the class; number of `frames`; those `found`, with a pose; of these `unknown`, with an unknown
+        heading, `wrong`, tail or heading off by more than `WRONG_PX`, `WRONG_ANGLE`, `reversed`, off by more than a
+        right angle, and `dishonest`, off by more than the covariance tells; `tail_px`, root mean square over those
+        found and not wrong, None if there are none, and `angle_deg`, the same of the heading; `covered`, share of the
+        visible thread that was followed, over all frames; `covered_90`, share of the frames with 90 % of it followed;
+        `wrong_line`, share of the published centreline where no thread is, None if none was published; `pieces`, share
+        of the visible thread that lies on pieces, over all frames; `wrong_pieces`, share of the pieces' length where no
+        thread is, None without pieces; `misplaced`, pieces whose place along the thread is said to be known and is
+        wrong; `complete`, frames of which is said that they show all of the thread, and `incomplete`, those of them
+        that don't; `free`, ends of which is said that they are the thread's, and `not_free`, those of them that are
+        not; `normalised`, root mean square of points' distances from the thread over their standard deviation, 1 if
+        honest; `median_ms`, CPU time of a frame.
+    """
     frames = list(results)
     found = [frame for frame in frames if frame.found]
     right = [frame for frame in found if not frame.is_wrong and not frame.unknown]
@@ -254,20 +218,20 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
         return float(np.sqrt(np.mean(np.square(values)))) if values else None
 
     normalised = share("normalised", "points")
-    return Row(
-        name=name,
-        frames=len(frames),
-        wrong=sum(frame.is_wrong for frame in found),
-        reversed=sum(frame.is_reversed for frame in found),
-        dishonest=sum(not frame.honest for frame in found),
-        tail_px=root_mean_square([frame.tail_px for frame in right]),
-        angle_deg=root_mean_square([math.degrees(frame.angle) for frame in right]),
-        covered=share("covered", "visible") or 0.0,
-        covered_90=float(np.mean([frame.covered >= 0.9 * frame.visible for frame in frames])),
-        wrong_line=share("wrong", "line"),
-        pieces=share("pieces", "visible") or 0.0,
-        wrong_pieces=share("wrong_pieces", "length"),
-        normalised=None if normalised is None else math.sqrt(normalised),
-        median_ms=1e3 * float(np.median([frame.seconds for frame in frames])),
+    return {
+        "name": name,
+        "frames": len(frames),
         **{field: total[field] for field in COUNTS},
-    )
+        "wrong": sum(frame.is_wrong for frame in found),
+        "reversed": sum(frame.is_reversed for frame in found),
+        "dishonest": sum(not frame.honest for frame in found),
+        "tail_px": root_mean_square([frame.tail_px for frame in right]),
+        "angle_deg": root_mean_square([math.degrees(frame.angle) for frame in right]),
+        "covered": share("covered", "visible") or 0.0,
+        "covered_90": float(np.mean([frame.covered >= 0.9 * frame.visible for frame in frames])),
+        "wrong_line": share("wrong", "line"),
+        "pieces": share("pieces", "visible") or 0.0,
+        "wrong_pieces": share("wrong_pieces", "length"),
+        "normalised": None if normalised is None else math.sqrt(normalised),
+        "median_ms": 1e3 * float(np.median([frame.seconds for frame in frames])),
+    }

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from benchmarks.vision.frames import DISH_RADIUS
-from benchmarks.vision.measurements import Row, frame_of, measure, row_of
+from benchmarks.vision.measurements import frame_of, measure, row_of
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.geometry.thread_observation import PieceEnd
@@ -45,9 +46,9 @@ COVERS = ["cover_1.5mm", "cover_3mm", "cover_6mm", "cover_10mm", "two_covers", "
 
 
 @cache
-def row(name: str) -> Row:
+def row(name: str) -> SimpleNamespace:
     """Return what the tracker makes of some frames of a class."""
-    return row_of(name, [measure(*frame_of(name, index, SEED)) for index in range(FRAMES)])
+    return SimpleNamespace(**row_of(name, [measure(*frame_of(name, index, SEED)) for index in range(FRAMES)]))
 
 
 @pytest.mark.parametrize("name", LIMITS)
