@@ -195,7 +195,7 @@ def random_scene(random: np.random.Generator) -> Scene:
 
 @dataclass
 class Tally:
-    """What was tally."""
+    """Counts of episodes, and how deep the needle came [m]."""
 
     seconds: float = 0.0
     steps: int = 0
@@ -209,7 +209,7 @@ class Tally:
     worst: list[dict[str, object]] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Add what another tally."""
+        """Add what another tally has."""
         deepest = max(self.deepest, other.deepest)
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)

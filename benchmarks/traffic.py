@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
 
+from benchmarks.attack.hostile import spoil
 from magnetosuture_thread.bags.packing import packed_pose, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import GuardedNode
@@ -21,7 +21,6 @@ from magnetosuture_thread.nodes.program import run
 RATES = {"commander": 50.0, "tracker": 60.0, "fuzzer": 1000.0}  # Hz
 SPEED = 0.001  # m/s; too slow for the bridge to judge whether a needle follows whose pose is always the same
 TAIL, HEADING = np.array([-0.0035, 0.0]), np.array([1.0, 0.0])
-ODD = (0.0, -0.0, 1.0, -1.0, 0.01, -0.02, 5e-324, 1e308, -1e308, math.inf, -math.inf, math.nan)
 
 
 class TrafficNode(GuardedNode):
@@ -70,33 +69,15 @@ class TrafficNode(GuardedNode):
         if not self._count:
             raise SystemExit
         self._count -= 1
-        random, stamp = self._random, self._stamp()
-        if random.random() < 0.3:
-            stamp = Time(sec=random.choice((0, -5, 2**31 - 1, stamp.sec - 1, stamp.sec + 1)))
-        frame = random.choice(("dish",) * 8 + ("", "map", "dish" * 1000))
-        values = [random.choice(ODD) if random.random() < 0.3 else random.uniform(-0.02, 0.02) for _ in range(4)]
-        if random.random() < 0.5:
-            command = TwistStamped()
-            command.header.stamp, command.header.frame_id = stamp, frame
-            command.twist.linear.x, command.twist.linear.y = values[:2]
-            if random.random() < 0.2:
-                command.twist.linear.z, command.twist.angular.z = values[2:]
-            self._commands.publish(command)
-            return
-        pose = PoseWithCovarianceStamped()
-        pose.header.stamp, pose.header.frame_id = stamp, frame
-        position, q = pose.pose.pose.position, pose.pose.pose.orientation
         # Most that is not odd is a needle that stays where it is: of others none would be believed, nothing driven.
-        position.x, position.y = values[:2]
-        angle = random.uniform(-math.pi, math.pi)
-        if random.random() < 0.9:
-            position.x, position.y = (
-                place + 5e-3 * value if abs(value) < 0.02 else value
-                for place, value in zip(TAIL.tolist(), values[:2], strict=True)
-            )
-            angle *= 1e-3
-        q.z, q.w = values[2:] if random.random() < 0.3 else (math.sin(0.5 * angle), math.cos(0.5 * angle))
-        self._poses.publish(pose)
+        message: Any = topics.NEEDLE_POSE.decode(packed_pose(self._stamp(), TAIL, HEADING))
+        publisher = self._poses
+        if self._random.random() < 0.5:
+            velocity = np.array([self._random.uniform(-0.02, 0.02) for _ in range(2)])
+            message, publisher = topics.NEEDLE_COMMAND.decode(packed_twist(self._stamp(), velocity)), self._commands
+        if self._random.random() < 0.7:
+            spoil(message, self._random.choice((0.02, 0.1, 0.5)), self._random)
+        publisher.publish(message)
 
     def _stamp(self) -> Time:
         return self.get_clock().now().to_msg()

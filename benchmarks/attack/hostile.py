@@ -115,7 +115,7 @@ class Attacker:
 
     def _request(self, client: Client) -> None:
         request = client.srv_type.Request()
-        self._spoil(request, 0.9)
+        spoil(request, 0.9, self._chance)
         if isinstance(request, ChangeState.Request):
             request.transition.id = self._chance.randrange(FIRST_IMPOSSIBLE_TRANSITION, 256)
         future = client.call_async(request)
@@ -147,50 +147,52 @@ class Attacker:
             message = topic.decode(data)
         except InvalidInputError:  # nothing yet, or an attack
             message = topic.message()
-        self._spoil(message, self._chance.choice((0.02, 0.2, 0.8)))
+        spoil(message, self._chance.choice((0.02, 0.2, 0.8)), self._chance)
         if hasattr(message, "header") and self._chance.random() < 0.7:
             message.header.stamp, message.header.frame_id = self._stamp(), "dish"
         return bytes(serialize_message(message))
 
-    def _spoil(self, message: Any, share: float) -> None:
-        """Replace a share of all fields."""
-        for name, kind in message.get_fields_and_field_types().items():
-            if "/" in kind and "<" not in kind and "[" not in kind:
-                self._spoil(getattr(message, name), share)
-            elif self._chance.random() < share:
-                setattr(message, name, self._value(kind))
-
-    def _value(self, kind: str) -> Any:
-        """Return a value of a field's type."""
-        if match := _SEQUENCE.match(kind):
-            most = int(match["bound"] or 1 << 30)
-            count = int(match["count"]) if match["count"] else min(self._chance.choice(LENGTHS), most)
-            return [self._value(match["kind"] or match["element"]) for _ in range(count)]
-        if kind.startswith(("string", "wstring")):
-            text = self._chance.choice(TEXTS) * self._chance.choice((1, 1, 1, 500))
-            bound = re.search(r"<(\d+)>", kind)
-            return text[: int(bound[1])] if bound else text
-        if kind in ("double", "float"):
-            number = self._chance.choice((*NUMBERS, self._chance.uniform(-0.02, 0.02)))
-            return number if kind == "double" or abs(number) < 1e38 or not math.isfinite(number) else 1e38
-        if kind == "boolean":
-            return self._chance.random() < 0.5
-        if kind in ("octet", "byte"):
-            return self._chance.randbytes(1)
-        if kind.removeprefix("u") in BITS:
-            bits = BITS[kind.removeprefix("u")]
-            low, high = (0, 2**bits - 1) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-            return self._chance.choice((low, high, 0, 1, 10, min(200, high), self._chance.randint(low, high)))
-        message = _interface(kind)()
-        if isinstance(message, Parameter):
-            message.name = self._chance.choice(TEXTS)
-            message.value = ParameterValue(type=self._chance.choice((*range(11), 200)))
-        self._spoil(message, 0.3)
-        return message
-
     def _time(self) -> Time:
         seconds = self._chance.choice((-1, -(2**31), 0, 5, 2**31 - 1, self._chance.randrange(1000)))
         return Time(sec=seconds, nanosec=self._chance.choice((0, 10**9, 2**32 - 1, self._chance.randrange(10**9))))
+
+
+def spoil(message: Any, share: float, chance: random.Random) -> None:
+    """Replace a share of all fields at random."""
+    for name, kind in message.get_fields_and_field_types().items():
+        if "/" in kind and "<" not in kind and "[" not in kind:
+            spoil(getattr(message, name), share, chance)
+        elif chance.random() < share:
+            setattr(message, name, _value(kind, chance))
+
+
+def _value(kind: str, chance: random.Random) -> Any:
+    """Return a value of a field's type."""
+    if match := _SEQUENCE.match(kind):
+        most = int(match["bound"] or 1 << 30)
+        count = int(match["count"]) if match["count"] else min(chance.choice(LENGTHS), most)
+        return [_value(match["kind"] or match["element"], chance) for _ in range(count)]
+    if kind.startswith(("string", "wstring")):
+        text = chance.choice(TEXTS) * chance.choice((1, 1, 1, 500))
+        bound = re.search(r"<(\d+)>", kind)
+        return text[: int(bound[1])] if bound else text
+    if kind in ("double", "float"):
+        number = chance.choice((*NUMBERS, chance.uniform(-0.02, 0.02)))
+        return number if kind == "double" or abs(number) < 1e38 or not math.isfinite(number) else 1e38
+    if kind == "boolean":
+        return chance.random() < 0.5
+    if kind in ("octet", "byte"):
+        return chance.randbytes(1)
+    if kind.removeprefix("u") in BITS:
+        bits = BITS[kind.removeprefix("u")]
+        low, high = (0, 2**bits - 1) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        return chance.choice((low, high, 0, 1, 10, min(200, high), chance.randint(low, high)))
+    message = _interface(kind)()
+    if isinstance(message, Parameter):
+        message.name = chance.choice(TEXTS)
+        message.value = ParameterValue(type=chance.choice((*range(11), 200)))
+    spoil(message, 0.3, chance)
+    return message
 
 
 def _clients(node: Node, target: str) -> list[Client]:
