@@ -23,8 +23,8 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation.frames import MARGIN, Array, FrameResult, WorstFrame, with_gaps
-from magnetosuture_thread.evaluation.metrics import RunMetrics, target_points
-from magnetosuture_thread.evaluation.tables import micrometres
+from magnetosuture_thread.evaluation.metrics import RunMetrics, compare_errors, target_points
+from magnetosuture_thread.evaluation.tables import error_text, micrometres
 from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
@@ -124,14 +124,9 @@ def _facts(metrics: RunMetrics) -> str:
     if metrics.minimum_margins:
         facts.append(f"an obstacle touched in {metrics.contact_frames} frames")
     lines = ["; ".join(facts)]
-    for kind, prefix in (("prediction", "error"), ("estimate", "estimate_error")):
-        errors = [
-            f"{figures['mean']:.3g} % from {AGAINST[target]} (maximum {figures['maximum']:.3g} %)"
-            for target, figures in metrics.errors(prefix).items()
-            if figures is not None
-        ]
-        if errors:
-            lines.append(f"mean distance of the {kind}, in % of the length: {'; '.join(errors)}")
+    for kind, errors in compare_errors(metrics.series).items():
+        if text := error_text(errors):
+            lines.append(f"mean distance of the {kind}, in % of the length: {text}")
     return "\n".join(lines)
 
 

@@ -7,8 +7,7 @@ import math
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
@@ -170,13 +169,11 @@ class CaseResult:
     Attributes:
         reference: the trajectory.
         vertices: predicted, shape (T, n + 1, 2) [m].
-        error_percent: shape (T,).
         score: the figures.
     """
 
     reference: ReferenceTrajectory
     vertices: NDArray[np.float64]
-    error_percent: NDArray[np.float64]
     score: CaseScore
 
     @property
@@ -331,7 +328,7 @@ def run_case(
         max_residual=max(figures.residual for figures in steps),
         fallbacks=sum(figures.fallbacks for figures in steps),
     )
-    return CaseResult(reference, vertices, error, score)
+    return CaseResult(reference, vertices, score)
 
 
 def score_rig(
@@ -382,25 +379,15 @@ def score_rig(
     return Evaluation("rig", "newton", _score_each(paths, score_case, progress, keep))
 
 
-@contextmanager
-def _thread_of(path: Path) -> Iterator[None]:
-    """Refuse metadata that does not describe a thread."""
-    try:
-        yield
-    except (*MALFORMED, ConfigurationError) as error:
-        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
-
-
 def _rig_thread(trajectory: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
     """Return the rig's thread that a trajectory's metadata describes, or refuse it."""
-    names = ("L_m", "EI_Nm2", "EA_N", "zeta_perp_Pa_s", "zeta_par_Pa_s", "diameter_m")
-    with _thread_of(path):
-        values = [float(trajectory.metadata["material"][name]) for name in names]
-        joint = NeedleJoint(trajectory.metadata["boundary"])
-    if not all(math.isfinite(value) and value > 0.0 for value in values):
-        raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
-    length, bending, stretching, across, along, diameter = values
-    return ThreadProperties(length, segments, bending, stretching, across, along, joint, diameter)
+    thread, _ = reference_thread(trajectory, path, segments)
+    stretching = trajectory.metadata["material"].get("EA_N")
+    if not (isinstance(stretching, (int, float)) and 0.0 < stretching < math.inf):
+        raise BagError(path, f"has a thread of the stretching stiffness EA_N {stretching}, expected more than 0 N")
+    drag, joint = (thread.medium.drag_across, thread.medium.drag_along), NeedleJoint(thread.attachment.value)
+    stiffness = thread.bending_stiffness, float(stretching)
+    return ThreadProperties(thread.length, segments, *stiffness, *drag, joint, thread.diameter)
 
 
 def reference_thread(
@@ -413,7 +400,7 @@ def reference_thread(
     Raises:
         BagError: the metadata lacks something, or holds something that is not valid.
     """
-    with _thread_of(path):
+    try:
         material = reference.metadata["material"]
         kind = str(material["kind"])
         thread = Thread(
@@ -425,6 +412,8 @@ def reference_thread(
             medium=Medium(float(material["zeta_perp_Pa_s"]), float(material["zeta_par_Pa_s"])),
             attachment=Attachment(reference.metadata["boundary"]),
         )
+    except (*MALFORMED, ConfigurationError) as error:
+        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
     if not thread.bending_stiffness * thread.medium.drag_along > 0.0:
         raise BagError(path, "has a thread whose stiffness or drag are not positive")
     family = "silk_6_0" if "silk" in kind else "polyamide_7_0"

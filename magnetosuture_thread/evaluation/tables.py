@@ -522,16 +522,18 @@ def _figures_table(title: str, lines: Mapping[str, str]) -> Table:
 
 
 def _errors(summary: RunSummary) -> dict[str, str]:
-    lines = {"thread measured": f"{100.0 * summary.seen_share:.1f} % of its length, mean"}
-    for kind, errors in (("prediction", summary.prediction), ("estimate", summary.estimate)):
-        means = [
-            f"{mean:.3f} % from {target} (maximum {errors[f'error_{name}_max_percent']:.3f} %)"
-            for name, target in (("measured", "the measured thread"), ("ground_truth", "ground truth"))
-            if (mean := errors.get(f"error_{name}_mean_percent")) is not None
-        ]
-        if means or kind == "prediction":
-            lines[f"{kind} error, mean"] = "; ".join(means) or "none"
-    return lines
+    mean = {"prediction error, mean": error_text(summary.prediction) or "none"}
+    lines = {"thread measured": f"{100.0 * summary.seen_share:.1f} % of its length, mean", **mean}
+    return lines | {"estimate error, mean": error_text(summary.estimate)}
+
+
+def error_text(errors: Mapping[str, float | None]) -> str:
+    """Return errors of `compare_errors` in words; empty if there are none."""
+    return "; ".join(
+        f"{mean:.3f} % from {target} (maximum {errors[f'error_{name}_max_percent']:.3f} %)"
+        for name, target in (("measured", "the measured thread"), ("ground_truth", "ground truth"))
+        if (mean := errors.get(f"error_{name}_mean_percent")) is not None
+    )
 
 
 def _spread(spread: Percentiles | None) -> str:
