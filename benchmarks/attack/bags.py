@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import os
+import multiprocessing
 import random
-import select
+import resource
 import shutil
-import signal
 import time
-import traceback
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -151,28 +149,24 @@ def _damaged(data: bytearray, kind: str, chance: random.Random) -> bytearray:
 
 def check_bag(bag: Path, original: Counter[Message]) -> tuple[Counter[str], float, float]:
     """Return what became of a bag, in a process of its own; and its time [s] and greatest memory [MB]."""
-    reading, writing = os.pipe()
-    began = time.monotonic()
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            os.close(reading)
-            os.write(writing, json.dumps(_check(bag, original)).encode())
-            code = 0
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            os._exit(code)
-    os.close(writing)
-    is_ready, _, _ = select.select([reading], [], [], MAX_SECONDS + GRACE)
-    answer = os.read(reading, 1 << 16) if is_ready else b""
-    os.close(reading)
-    if not is_ready:
-        os.kill(child, signal.SIGKILL)
-    _, _, usage = os.wait4(child, 0)
-    outcome: Counter[str] = Counter(json.loads(answer)) if answer else Counter(ended=1, tracebacks=int(bool(is_ready)))
-    return outcome, time.monotonic() - began, usage.ru_maxrss / 1024.0
+    forked, began = multiprocessing.get_context("fork"), time.monotonic()
+    receiver, sender = forked.Pipe(duplex=False)
+    child = forked.Process(target=_check_and_send, args=(sender, bag, original))
+    child.start()
+    sender.close()
+    outcome, megabytes = {"ended": 1}, 0.0
+    try:
+        if receiver.poll(MAX_SECONDS + GRACE):
+            outcome, megabytes = receiver.recv()
+    except EOFError:  # it has printed why
+        outcome["tracebacks"] = 1
+    child.kill()
+    child.join()
+    return Counter(outcome), time.monotonic() - began, megabytes
+
+
+def _check_and_send(sender: Connection, bag: Path, original: Counter[Message]) -> None:
+    sender.send((_check(bag, original), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0))
 
 
 def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
