@@ -313,8 +313,8 @@ class Consistency:
     windows: int = 0
     windows_within_band: int = 0
     windows_within_band_share: float | None = None
-    means: Array = field(default_factory=partial(np.empty, 0))
-    high: Array = field(default_factory=partial(np.empty, 0))
+    means: Array = field(default_factory=partial(np.empty, 0), compare=False)
+    high: Array = field(default_factory=partial(np.empty, 0), compare=False)
 
     @classmethod
     def of(cls, series: TimeSeries) -> Consistency:
