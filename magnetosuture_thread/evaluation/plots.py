@@ -125,7 +125,7 @@ def _facts(metrics: RunMetrics) -> str:
         facts.append(f"an obstacle touched in {metrics.contact_frames} frames")
     lines = ["; ".join(facts)]
     for kind, errors in compare_errors(metrics.series).items():
-        if text := error_text(errors):
+        if text := error_text(errors, AGAINST["seen"]):
             lines.append(f"mean distance of the {kind}, in % of the length: {text}")
     return "\n".join(lines)
 

@@ -527,11 +527,11 @@ def _errors(summary: RunSummary) -> dict[str, str]:
     return lines | {"estimate error, mean": error_text(summary.estimate)}
 
 
-def error_text(errors: Mapping[str, float | None]) -> str:
-    """Return errors of `compare_errors` in words; empty if there are none."""
+def error_text(errors: Mapping[str, float | None], seen: str = "the measured thread") -> str:
+    """Return errors of `compare_errors` in words, with what is `seen`; empty if there are none."""
     return "; ".join(
         f"{mean:.3f} % from {target} (maximum {errors[f'error_{name}_max_percent']:.3f} %)"
-        for name, target in (("measured", "the measured thread"), ("ground_truth", "ground truth"))
+        for name, target in (("measured", seen), ("ground_truth", "ground truth"))
         if (mean := errors.get(f"error_{name}_mean_percent")) is not None
     )
 
