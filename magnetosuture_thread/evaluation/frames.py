@@ -250,23 +250,21 @@ class ErrorMap:
     def __init__(self, length: float, columns: int = 300) -> None:
         self._length, self._limit = length, 2 * columns
         self._frames = 1  # of a column
-        self._filled = 0  # frames in the last column
+        self._count = 0  # frames in all columns
         self._times: list[float] = []
         self._columns: list[Array] = []
 
     def add(self, time: float, errors: Array) -> None:
         """Add the errors of one frame's nodes, in % of the length."""
-        if self._columns and self._filled < self._frames:
-            self._columns[-1] = np.fmax(self._columns[-1], errors)
-            self._filled += 1
-            return
-        if len(self._columns) == self._limit:
+        if self._count == self._limit * self._frames:
             self._columns = [np.fmax(a, b) for a, b in zip(self._columns[::2], self._columns[1::2], strict=True)]
-            self._times = self._times[::2]
-            self._frames *= 2
-        self._times.append(time)
-        self._columns.append(errors)
-        self._filled = 1
+            self._times, self._frames = self._times[::2], 2 * self._frames
+        if self._count % self._frames:
+            self._columns[-1] = np.fmax(self._columns[-1], errors)
+        else:
+            self._times.append(time)
+            self._columns.append(errors)
+        self._count += 1
 
     def grid(self) -> tuple[Array, Array, Array] | None:
         """Return the greatest error by time and arc length, empty in each long gap; None if there is nothing.

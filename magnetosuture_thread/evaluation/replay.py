@@ -322,16 +322,14 @@ def recorded_latency(recording: Recording, start: float, duration: float | None)
         return {}
     answers = interface.NEEDLE_POSE, interface.PREDICTED_THREAD, interface.CURRENTS
     channels = [channel for channel in answers if recording.counts.get(channel.recorded)]
-    latencies = {channel.recorded: array("d") for channel in channels}
-    latest = dict.fromkeys(latencies, 0)
-    for record in recording.records(channels, start=start, duration=duration):
-        stamp = _answered_stamp(record)
-        if stamp > latest[record.topic]:
-            latest[record.topic] = stamp
-            latencies[record.topic].append((record.time - stamp) * 1e-9)
     stages = dict(zip((channel.recorded for channel in answers), STAGES, strict=True))
-    percentiles = {stages[topic]: Percentiles.of(times) for topic, times in latencies.items()}
-    known = {stage: spread for stage, spread in percentiles.items() if spread is not None}
+    latencies, latest = {stage: array("d") for stage in STAGES}, dict.fromkeys(STAGES, 0)
+    for record in recording.records(channels, start=start, duration=duration):
+        stage, stamp = stages[record.topic], _answered_stamp(record)
+        if stamp > latest[stage]:
+            latest[stage] = stamp
+            latencies[stage].append((record.time - stamp) * 1e-9)
+    known = {stage: spread for stage, times in latencies.items() if (spread := Percentiles.of(times)) is not None}
     one_clock = all(0.0 <= spread.median <= 10.0 for spread in known.values())
     return known if one_clock and any(spread.maximum > 0.0 for spread in known.values()) else {}
 
