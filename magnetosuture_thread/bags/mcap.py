@@ -330,12 +330,10 @@ class McapFile:
         ):
             return False
         for index in chunks:
-            place, counts = (
-                (index.chunk_start_offset, index.chunk_length),
-                dict.fromkeys(index.message_index_offsets, 0),
-            )
+            counts = dict.fromkeys(index.message_index_offsets, 0)
             times = index.message_start_time, index.message_end_time
-            self._blocks.append(Block(*place, True, True, None, *times, counts))
+            block = Block(index.chunk_start_offset, index.chunk_length, True, True, None, *times, counts)
+            self._blocks.append(block)
         self._metadata, self.others["attachment"] = metadata, statistics.attachment_count
         return True
 

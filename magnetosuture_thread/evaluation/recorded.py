@@ -22,7 +22,6 @@ from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import parse_scene_message, stamp_of
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.storage import SALVAGED_NOTE
 from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
@@ -411,9 +410,7 @@ class BagInput:
     @property
     def notes(self) -> dict[str, str]:
         """Return the notes of a bag made from this one."""
-        reason = self.recording.salvaged_without_checksum
-        notes = {**self.recording.notes, **({SALVAGED_NOTE: reason} if reason else {})}
-        return {**notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
+        return {**self.recording.notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
 
     def observations(self, progress: Progress = lambda share: None) -> ObservationReader:
         """Return the observations; `progress` is called with the share done, 0 to 1."""
@@ -439,11 +436,10 @@ def chosen_source(recording: Recording, source: str) -> str:
     """
     if recording.camera is not None and source != "poses":
         return "camera"
-    if recording.counts.get(interface.NEEDLE_POSE.recorded) and source != "camera":
-        return "poses"
-    recording.refuse_unfit(*interface.CAMERA.values(), interface.NEEDLE_POSE)
-    recording.require(interface.NEEDLE_POSE if source == "poses" else interface.COMPRESSED_IMAGE)
-    raise BagError(recording.path, "holds camera frames on a topic that is not theirs")  # require says all else
+    if source == "camera" or not recording.counts.get(interface.NEEDLE_POSE.recorded):
+        recording.refuse_unfit(*interface.CAMERA.values(), interface.NEEDLE_POSE)
+        recording.require(interface.NEEDLE_POSE if source == "poses" else interface.COMPRESSED_IMAGE)
+    return "poses"
 
 
 @contextmanager
