@@ -297,16 +297,25 @@ class Bag:
             if topic in self.conflicts:
                 raise BagError(self.path, self.conflict(topic))
         wanted = set(self.topics if topics is None else topics)
-        loaded = (self._load(item, refused, cdr_only=True) for item in self._stored(wanted, start, duration))
+        loaded = (self._load(item, refused, cdr_only=True) for item in self.stored(wanted, start, duration))
         return (record for record in loaded if record is not None)
 
     def conflict(self, topic: str) -> str:
         """Return in words that a topic has two types."""
         return f"topic {topic} has two types, {' and '.join(self.conflicts[topic])}; expected one"
 
-    def stored(self) -> Iterator[storage.StoredMessage]:
-        """Yield all messages by time as they are stored, whatever their type or serialization."""
-        return self._stored(set(self.counts), 0.0, None)
+    def stored(
+        self, topics: Collection[str] | None = None, start: float = 0.0, duration: float | None = None
+    ) -> Iterator[storage.StoredMessage]:
+        """Yield messages by time as they are stored, whatever their type or serialization; see `records`."""
+        wanted, first = set(self.counts) if topics is None else topics, self.start + round(start * 1e9)
+        last = self.end if duration is None else first + round(duration * 1e9)
+        parts = []
+        for file in sorted(self._files, key=lambda file: file.start):
+            numbers = [number for number, c in file.connections.items() if self._names[c.topic] in wanted]
+            if numbers:
+                parts.append((file.start, file.messages(numbers, first, last)))
+        return storage.merge_by_time(parts)
 
     def load(self, item: storage.StoredMessage) -> bytes:
         """Return a stored message as it was before the recorder packed it, if it did.
@@ -360,16 +369,6 @@ class Bag:
             refused[str(error)] += 1
             return None
         return RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self._decoder_of)
-
-    def _stored(self, topics: Collection[str], start: float, duration: float | None) -> Iterator[storage.StoredMessage]:
-        first = self.start + round(start * 1e9)
-        last = self.end if duration is None else first + round(duration * 1e9)
-        parts = []
-        for file in sorted(self._files, key=lambda file: file.start):
-            numbers = [number for number, c in file.connections.items() if self._names[c.topic] in topics]
-            if numbers:
-                parts.append((file.start, file.messages(numbers, first, last)))
-        return storage.merge_by_time(parts)
 
 
 def _open(files: list[Path], budget: Budget, progress: Progress) -> tuple[list[BagFile], list[CorruptRegion]]:
