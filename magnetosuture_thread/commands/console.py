@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, closing, suppress
+from contextlib import AsyncExitStack, ExitStack, closing, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.console.server import ConsoleServer, serve_until
+from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.evaluation.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.evaluation.workers import Log
@@ -115,13 +115,20 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
 
 async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     """Serve the page until this process gets a signal to end, or the graph breaks."""
-    ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
-    try:
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+    async with AsyncExitStack() as stack:
+        stack.push_async_callback(host.close)
         host.start()
-        server, period = ConsoleServer(graph.settings, graph, host), 0.2  # s between two checks of the nodes
-        await serve_until(ends, server, host.watch, period, lambda url: log(f"open {url}\nCtrl-C ends everything"))
-    finally:
-        await host.close()
+        server = ConsoleServer(graph.settings, graph, host)
+        for which in STOPS:
+            if signal.getsignal(which) is not signal.SIG_IGN:
+                loop.add_signal_handler(which, ended.set)
+        stack.push_async_callback(server.stop)  # so the needle is stopped first
+        log(f"open {await server.start()}\nCtrl-C ends everything")
+        while not ended.is_set():
+            await host.watch()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(ended.wait(), 0.2)  # s between two checks of the nodes
     log("ended")
 
 

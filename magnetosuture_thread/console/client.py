@@ -307,20 +307,12 @@ def encode_state(graph: dict[str, Any], host: dict[str, Any], lease: dict[str, A
     try:
         return json.dumps(state, allow_nan=False, separators=(",", ":"))
     except ValueError:
-        return json.dumps(_finite(state), allow_nan=False, separators=(",", ":"))
+        return json.dumps(json.loads(json.dumps(state), parse_constant=lambda name: None), separators=(",", ":"))
 
 
 def encode_frame(number: int, image: bytes) -> bytes:
     """Encode a camera frame: its number in 8 bytes, big endian, then the image."""
     return struct.pack(">Q", number) + image
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class RequestHandler:
@@ -379,8 +371,6 @@ class RequestHandler:
 
     async def _execute(self, message: ClientMessage, operator: str, reply: Reply) -> None:
         try:
-            if message.type not in self._calls:
-                raise InvalidInputError("message", message.type, "a request")
             others = {"operator": operator} if message.type == "record" else {}
             refusal = await self._calls[message.type](**message.values, **others)
         except MagnetosutureError as error:
@@ -415,7 +405,7 @@ class Client:
         requests: RequestHandler,
     ) -> None:
         self.number, self.address, self.has_token = number, request.remote or "", False
-        self.is_script, self._can_command = True, False
+        self.is_script = True
         self._socket, self._request, self._settings, self._token = socket, request, settings, token
         self._jog, self._requests = requests.jog, requests
         self._outbox, self._wake = Outbox(), asyncio.Event()
@@ -434,7 +424,7 @@ class Client:
             if not await self._handshake():
                 return
             sending = asyncio.create_task(self._send_all())
-            receive = self._on_message if self._can_command else self._on_watcher_message
+            receive = self._on_message if self.has_token else self._on_watcher_message
             async for message in self._socket:
                 if message.type in (WSMsgType.PING, WSMsgType.PONG):
                     await self._on_ping(message.type, message.data)
@@ -464,12 +454,12 @@ class Client:
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
         self._lateness(parsed, asyncio.get_running_loop().time())
-        self._can_command = self.has_token = same_token(token := parsed.values["token"], self._token)
+        self.has_token = same_token(token := parsed.values["token"], self._token)
         # Programs other than browsers name no origin.
         self.is_script = parsed.values["automated"] is not False or not self._request.headers.get("Origin")
-        refusal = "the token is wrong" if token and not self._can_command else ""
+        refusal = "the token is wrong" if token and not self.has_token else ""
         speeds = {"speed": self._settings.speed, "max_speed": self._settings.max_speed}
-        self._reply("welcome", client=self.number, can_command=self._can_command, refusal=refusal, **speeds)
+        self._reply("welcome", client=self.number, can_command=self.has_token, refusal=refusal, **speeds)
         return True
 
     def _read(self, kind: WSMsgType, data: Any) -> ClientMessage:
@@ -479,8 +469,7 @@ class Client:
 
     async def _on_ping(self, kind: WSMsgType, data: bytes) -> None:
         """Answer a ping, and count it like any message: no page sends one, but other programs may."""
-        exceeded = self._count_message(asyncio.get_running_loop().time())
-        if exceeded or (not self._can_command and self._message_count > MAX_WATCHER_RATE):
+        if self._count_message(asyncio.get_running_loop().time()):
             self._abort()
         elif kind is WSMsgType.PING:
             with suppress(ConnectionError):
@@ -512,8 +501,7 @@ class Client:
         if '"acknowledge"' in text and self._outbox.acknowledge("frame" if '"frame"' in text else "state"):
             self._wake.set()
             return
-        self._count_message(asyncio.get_running_loop().time())
-        if self._message_count > MAX_WATCHER_RATE:
+        if self._count_message(asyncio.get_running_loop().time()):
             self._abort()  # at once, without the formalities of closing
         elif '"visibility"' not in text:
             expected = "the one in the console's address: this page only watches"
@@ -565,7 +553,7 @@ class Client:
     def _count_message(self, now: float) -> bool:
         """Count a message; return whether it exceeds the maximum rate."""
         self._message_count = self._rate.count(self.address, now)
-        exceeded = self._message_count > MAX_MESSAGE_RATE
+        exceeded = self._message_count > (MAX_MESSAGE_RATE if self.has_token else MAX_WATCHER_RATE)
         self._excess += exceeded
         return exceeded
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import signal
 import ssl
-from collections.abc import Awaitable, Callable, Iterable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -185,35 +183,6 @@ class ConsoleServer:
         graph = self._graph.state()
         jog.set_armed(bool((graph.get("bridge") or {}).get("armed")))
         return encode_state(graph, self._host.state(), lease)
-
-
-async def serve_until(
-    ends: Iterable[signal.Signals],
-    server: ConsoleServer,
-    watch: Callable[[], Awaitable[None]],
-    period: float,
-    report: Callable[[str], None],
-) -> None:
-    """Serve the page until this process gets a signal to end; the needle is stopped first.
-
-    Args:
-        ends: the signals.
-        server: of the page.
-        watch: called once in each period; what it raises ends the serving too.
-        period: [s].
-        report: called with the URL of the page.
-    """
-    loop, ended = asyncio.get_running_loop(), asyncio.Event()
-    for which in ends:
-        loop.add_signal_handler(which, ended.set)
-    report(await server.start())
-    try:
-        while not ended.is_set():
-            await watch()
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(ended.wait(), period)
-    finally:
-        await server.stop()
 
 
 def _answer(status: int, text: str) -> web.Response:

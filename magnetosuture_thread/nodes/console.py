@@ -62,7 +62,7 @@ class ConsoleGraph:
 
     Args:
         node: in the graph, and in an executor that nobody else spins.
-        settings: of the
+        settings: of the page.
 
     Attributes:
         node: as given.
@@ -86,19 +86,29 @@ class ConsoleGraph:
         self._tips = topics.NEEDLE_TIP.publisher(node)
         self._procedures = {name: read_procedure(name).shape_names for name in shipped_names("procedure")}
         self._number = 0
-        self._open(settings, _file_scene(settings))
+        self._inboxes: list[Inbox] = []
+        self.begin(settings)
 
     def begin(self, settings: ConsoleSettings) -> None:
-        """Restart: drop all states, for a graph whose nodes were restarted.
+        """Begin, or restart: drop all states, for a graph whose nodes were restarted.
 
         Raises:
             ConfigurationError: the settings' scene cannot be read; nothing is changed.
         """
-        scene = _file_scene(settings)
-        for latest in (*self._latest.values(), self._camera):
-            latest.close()
-        self._reports.close()
-        self._open(settings, scene)
+        # To show until one is received.
+        scene = shown_scene(read_scene(settings.scene)) if settings.scene else None
+        for inbox in self._inboxes:
+            inbox.close()
+        self.settings, self._scene = settings, scene
+        self._latest = {
+            name: Latest(self.node, topic, read, period, max_bytes=1 << 18)
+            for name, (topic, read, period, _) in READERS.items()
+        }
+        self._reports = Inbox(self.node, topics.DIAGNOSTICS, 50)
+        self._diagnostics: dict[str, tuple[dict[str, Any], int]] = {}
+        raw = settings.image_transport == "raw"
+        self._camera = Latest(self.node, topics.IMAGE if raw else topics.COMPRESSED_IMAGE, _jpeg if raw else _bytes)
+        self._inboxes = [*self._latest.values(), self._reports, self._camera]
 
     def publish_velocity(self, velocity: tuple[float, float]) -> None:
         """Publish an operator velocity command; nothing while commands are blocked."""
@@ -131,8 +141,6 @@ class ConsoleGraph:
 
         The emergency stop is never blocked. The latest action cancels one that still waits for its answer.
         """
-        if action not in ACTIONS:
-            return f"action: got {action!r}, expected one of {', '.join(ACTIONS)}"
         if self.blocked and action != "stop":
             return self.blocked
         self._action += 1
@@ -228,17 +236,6 @@ class ConsoleGraph:
         """Take what has come, and answer requests."""
         self.node.executor.spin_some()
 
-    def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
-        self.settings, self._scene = settings, scene
-        self._latest = {
-            name: Latest(self.node, topic, read, period, max_bytes=1 << 18)
-            for name, (topic, read, period, _) in READERS.items()
-        }
-        self._reports = Inbox(self.node, topics.DIAGNOSTICS, 50)
-        self._diagnostics: dict[str, tuple[dict[str, Any], int]] = {}
-        raw = settings.image_transport == "raw"
-        self._camera = Latest(self.node, topics.IMAGE if raw else topics.COMPRESSED_IMAGE, _jpeg if raw else _bytes)
-
 
 def _name_within(space: str, name: str) -> str:
     """Return a node's name without the namespace of the graph, empty for a node of a rig in another namespace.
@@ -249,11 +246,6 @@ def _name_within(space: str, name: str) -> str:
     is_ours = inside.rpartition("/")[2] in (*interface.ALL_NODES, NAME)
     is_elsewhere = "/" in inside or (bool(space) and inside == name)
     return "" if is_ours and is_elsewhere else inside
-
-
-def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:
-    """Return the scene to show until one is received; None where the settings name none."""
-    return shown_scene(read_scene(settings.scene)) if settings.scene else None
 
 
 def _bytes(message: Any) -> bytes:
