@@ -75,8 +75,7 @@ def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int
     setup = with_rig(read_procedure_setup(procedure, options.setup), options.rig)
     run.check_run(procedure, setup, run.vary(setup, seeds[0]))
     result = CampaignResult(procedure, setup, options.camera, options.latency)
-    about = setup.path.read_text(encoding="utf-8"), options.camera, options.latency
-    work = partial(_run, procedure, setup, *about)
+    work = partial(_run, result, setup.path.read_text(encoding="utf-8"))
     with (
         terminal.progress("campaign") as advance,
         whole_folder(options.output) as folder,
@@ -159,27 +158,27 @@ class CampaignResult:
 Task = tuple[int, Path | None]  # seed, and folder of the bag if any
 
 
-def _run(
-    procedure: Procedure,
-    setup: Setup,
-    text: str,
-    camera: bool,
-    latency: float,
-    task: Task,
-    log: Log,
-    progress: Progress,
-) -> tuple[run.RunResult, float]:
-    """Run one seed, with the folder of its bag if any; return what came of it, and its processor time [s]."""
+def _run(campaign: CampaignResult, text: str, task: Task, log: Log, progress: Progress) -> tuple[run.RunResult, float]:
+    """Run one seed, with the folder of its bag if any; return what came of it, and its processor time [s].
+
+    Args:
+        campaign: that it is of; what its other runs came to does not matter.
+        text: of the setup's file, which a worker may not have.
+        task: the seed and the folder.
+        log: not called.
+        progress: not called.
+    """
     began, (seed, folder) = process_time(), task
+    procedure, setup, camera = campaign.procedure, campaign.setup, campaign.camera
     if folder is not None and not folder.parents[1].is_dir():
         raise BagError(folder, "cannot be recorded: this worker does not have the output's folder")
     what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}"
-    what += f", latency {latency:g} s, seed {seed}"
+    what += f", latency {campaign.latency:g} s, seed {seed}"
     notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
         recorder = None if bag is None else RunBag(bag, setup, camera=camera)
-        variation = replace(run.vary(setup, seed), latency=latency)
+        variation = replace(run.vary(setup, seed), latency=campaign.latency)
         result = run.run_procedure(procedure, setup, variation, camera=camera, recorder=recorder)
     return result, process_time() - began
 

@@ -76,7 +76,7 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
 
     Errors are mean distances of the nodes in % of the thread's length.
     """
-    is_bags = kind_of(options.paths) == "bags"
+    is_bags = are_bags(options.paths)
     for name in REFERENCE_OPTIONS if is_bags else BAG_OPTIONS:
         value = getattr(options, name)
         if value != options.default_of(name):
@@ -147,7 +147,7 @@ def evaluate_bags(
     work = partial(
         evaluate_one, against=against, formulation=formulation, selection=selection, is_drawn=output is not None
     )
-    rows: dict[int, Row] = {}
+    rows: list[Row] = [{} for _ in tasks]
     with ExitStack() as stack:
         folder = stack.enter_context(whole_folder(output)) if output is not None else None
         runner = stack.enter_context(TaskRunner(work, workers, scheduler))
@@ -159,10 +159,9 @@ def evaluate_bags(
             if folder is not None and picture:
                 (folder / f"{name}.png").write_bytes(picture)
             rows[index] = row
-        ordered = [rows[index] for index in range(len(tasks))]
         if folder is not None:
-            tables.write_table(folder / "table.json", ordered, tables.bags_document(ordered))
-    return ordered
+            tables.write_table(folder / "table.json", rows, tables.bags_document(rows))
+    return rows
 
 
 def evaluate_one(
@@ -290,8 +289,8 @@ def _bags(path: Path, depth: int) -> list[Path]:
     return files + below
 
 
-def kind_of(paths: Sequence[Path]) -> str:
-    """Return `references` or `bags`.
+def are_bags(paths: Sequence[Path]) -> bool:
+    """Return whether paths are bags, and not reference trajectories.
 
     Raises:
         ConfigurationError: there are both.
@@ -300,7 +299,7 @@ def kind_of(paths: Sequence[Path]) -> str:
     if 0 < len(references) < len(paths):
         expected = "bags alone, or reference trajectories alone, in one call"
         raise ConfigurationError("PATH", str(references[0]), expected)
-    return "references" if references else "bags"
+    return not references
 
 
 def _is_reference(path: Path) -> bool:
