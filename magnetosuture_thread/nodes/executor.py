@@ -221,19 +221,15 @@ class Timeline:
         """Whether it is paused."""
         return self._paused is not None
 
-    def pause(self, still: bool) -> None:
-        """Pause the time, or resume it."""
+    def on_pause(self, request: Any, answer: Any) -> Any:
+        """Pause the time, or resume it, as a service SetBool."""
         now = time.perf_counter()
-        if still and self._paused is None:
+        if request.data and self._paused is None:
             self._paused = now
-        elif not still and self._paused is not None:
+        elif not request.data and self._paused is not None:
             if self._began is not None:
                 self.stood += now - self._paused
             self._paused = None
-
-    def on_pause(self, request: Any, answer: Any) -> Any:
-        """Pause the time, or resume it, as a service SetBool."""
-        self.pause(request.data)
         answer.success = True
         answer.message = f"{'paused' if request.data else 'goes on'} at {self.elapsed():.2f} s"
         return answer

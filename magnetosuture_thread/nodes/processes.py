@@ -11,8 +11,8 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -204,9 +204,8 @@ def raise_priority(priority: int) -> str:
         return "ordinary"
     try:
         for thread in Path("/proc/self/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
-    except ProcessLookupError:
-        pass  # a thread that has just ended
+            with suppress(ProcessLookupError):  # a thread that has just ended
+                os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
         return f"ordinary; real-time priority {priority} refused ({error.strerror}), see `ulimit -r`"
     return f"real time, priority {priority}"
@@ -227,15 +226,13 @@ class Interruption:
 
     def __init__(self) -> None:
         self._asked = False
-        self._before: list[tuple[signal.Signals, Callable[[int, FrameType | None], Any]]] = []
+        self._before: dict[signal.Signals, Any] = {}  # handlers
 
     def __enter__(self) -> Interruption:
         """Begin to keep signals."""
         if threading.current_thread() is threading.main_thread():
-            handlers = [(which, signal.getsignal(which)) for which in STOPS]
-            self._before = [(which, handler) for which, handler in handlers if callable(handler)]
-            for which, _ in self._before:
-                signal.signal(which, self._keep)
+            kept = [which for which in STOPS if callable(signal.getsignal(which))]
+            self._before = {which: signal.signal(which, self._keep) for which in kept}
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -244,7 +241,7 @@ class Interruption:
         Raises:
             KeyboardInterrupt: a signal came.
         """
-        for which, handler in self._before:
+        for which, handler in self._before.items():
             signal.signal(which, handler)
         if error[0] is None:
             self.check()

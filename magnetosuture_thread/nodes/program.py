@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import MagnetosutureError
@@ -46,7 +45,7 @@ def main() -> int:
     name = Path(sys.argv[0]).name
     for which in STOPS:
         if signal.getsignal(which) is not signal.SIG_IGN:
-            signal.signal(which, _leave)
+            signal.signal(which, lambda number, frame: os._exit(0))
     try:
         try:
             module = import_module(f"magnetosuture_thread.nodes.{name}")
@@ -57,19 +56,6 @@ def main() -> int:
     finally:
         for which in STOPS:
             signal.signal(which, signal.SIG_IGN)
-
-
-def _leave(number: int, frame: FrameType | None) -> None:
-    os._exit(0)
-
-
-def end_signals() -> tuple[signal.Signals, ...]:
-    """Return the signals that end a node in order; not SIGHUP where nohup ignores it.
-
-    What a shell runs in the background ignores SIGINT, but a node's parent ends it by that.
-    """
-    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    return tuple(which for which in STOPS if which is not signal.SIGHUP or not ignored)
 
 
 def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Sequence[str] | None = None) -> int:
@@ -91,6 +77,7 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         0 when it was asked to end, 1 with one line on standard error when it could not start or go on.
     """
     import rclpy
+    from rclpy.duration import Duration
     from rclpy.exceptions import ParameterException
     from rclpy.executors import ExternalShutdownException
     from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -120,8 +107,11 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         os.set_blocking(written, False)
         signal.set_wakeup_fd(written, warn_on_full_buffer=False)
         threading.Thread(target=end, name="signals", daemon=True).start()
-        for which in end_signals():
-            signal.signal(which, lambda number, frame: None)
+        for which in STOPS:
+            # Of those that are ignored only SIGHUP stays so, as by nohup: what a shell runs in the background ignores
+            # SIGINT, but a node's parent ends it by that.
+            if which is not signal.SIGHUP or signal.getsignal(which) is not signal.SIG_IGN:
+                signal.signal(which, lambda number, frame: None)
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
         made = make()
         nodes = made if isinstance(made, tuple) else (made,)
@@ -132,7 +122,12 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         gc.collect()
         gc.freeze()
         nodes[0].spin(executor, lambda: is_ending.is_set() or all(node.has_ended for node in nodes))
-        _finish(nodes)
+        for node in nodes:
+            node.finish()
+        until = time.monotonic() + DELIVERY_TIMEOUT
+        for node in nodes:
+            for publisher in node.publishers:
+                publisher.wait_for_all_acked(Duration(seconds=max(0.0, until - time.monotonic())))
     except ExternalShutdownException:  # something else in this process has shut the context down
         return 0
     except Exception as error:
@@ -152,18 +147,6 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
-
-
-def _finish(nodes: tuple[GuardedNode, ...]) -> None:
-    """Let nodes publish their final messages, and give the middleware the time to deliver them."""
-    from rclpy.duration import Duration
-
-    for node in nodes:
-        node.finish()
-    until = time.monotonic() + DELIVERY_TIMEOUT
-    for node in nodes:
-        for publisher in node.publishers:
-            publisher.wait_for_all_acked(Duration(seconds=max(0.0, until - time.monotonic())))
 
 
 if __name__ == "__main__":
