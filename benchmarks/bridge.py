@@ -301,16 +301,15 @@ def loop_timing(client: CoilClient) -> tuple[list[float], str]:
     from magnetosuture_thread.nodes import topics
     from magnetosuture_thread.nodes.clients import Inbox
     from magnetosuture_thread.nodes.coil_bridge import JITTER_KEYS
-    from magnetosuture_thread.nodes.node import SCHEDULING, read_status
+    from magnetosuture_thread.nodes.node import SCHEDULING, read_report
 
     reports = Inbox(client.node, topics.DIAGNOSTICS, 10)
 
     def read() -> dict[str, str] | None:
-        statuses = (status for report, _ in reports.read() for status in report.status)
-        bridges = (read_status(status)[1] for status in statuses if status.name.startswith("coil_bridge:"))
-        return next((values for values in bridges if SCHEDULING in values), None)
+        bridges = (read_report(report).get("coil_bridge", ("", {})) for report, _ in reports.read())
+        return next((values for _, values in bridges if SCHEDULING in values), None)
 
-    values = client.wait_for(read, "no coil_bridge diagnostics received")
+    values = client.wait_for(read, lambda: GraphError("no coil_bridge diagnostics received"))
     return [float(values[name]) for name in JITTER_KEYS], values[SCHEDULING]
 
 

@@ -33,7 +33,7 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reading import constant_name
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, read_status
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, read_report
 from magnetosuture_thread.nodes.parameters import start_ros
 from magnetosuture_thread.settings.errors import GraphError, shortened
 from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, STARTS, Service
@@ -306,8 +306,8 @@ class CoilClient(Participant):
         }
 
     def _wait_for_state(self) -> CoilBridgeState:
-        problem = "no coil_bridge state received on this ROS domain"
-        return self.wait_for(lambda: self._state.value if self._state.poll() else None, problem)
+        problem = f"no coil_bridge state received on this ROS domain within {TIMEOUT:g} s"
+        return self.wait_for(lambda: self._state.poll() and self._state.value, lambda: GraphError(problem))
 
     def _call(self, name: str, request: Any, **options: Any) -> Any:
         try:
@@ -317,20 +317,26 @@ class CoilClient(Participant):
                 raise
             raise GraphError(f"no coil_bridge on this ROS domain: {error}") from None
 
-    def wait_for(self, read: Callable[[], Any], problem: str) -> Any:
-        """Return what a function returns, once that is not None.
+    def turn(self) -> None:
+        """Wait for a moment, and take what has come."""
+        time.sleep(POLL_PERIOD)
+        self.spin_some()
 
-        Raises:
-            GraphError: that takes too long; with the problem.
+    def wait_for(self, read: Callable[[], Any], failed: Callable[[], Exception], timeout: float = TIMEOUT) -> Any:
+        """Return what a function returns, once that is true.
+
+        Args:
+            read: the function.
+            failed: returns what is raised where that takes too long.
+            timeout: that is too long [s].
         """
-        deadline = time.monotonic() + TIMEOUT
+        deadline = time.monotonic() + timeout
         while True:
-            self.spin_some()
-            if (value := read()) is not None:
+            self.turn()  # first: what has been waiting since is old
+            if value := read():
                 return value
             if time.monotonic() > deadline:
-                raise GraphError(f"{problem} within {TIMEOUT:g} s")
-            time.sleep(POLL_PERIOD)
+                raise failed()
 
 
 def _millimetres(vector: Any) -> str:
@@ -441,7 +447,5 @@ class Recorder(Participant):
         self._receive(topic.channel.recorded, now, data)
         if topic.channel is DIAGNOSTICS:
             with suppress(InvalidInputError):
-                for status in topic.decode(data).status:
-                    name = status.name.split(":")[0]
-                    if name in ALL_NODES:
-                        self.status_texts[name] = read_status(status)
+                report = read_report(topic.decode(data))
+                self.status_texts |= {name: report[name] for name in ALL_NODES if name in report}

@@ -19,7 +19,6 @@ from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.msg import CoilBridgeState
 from magnetosuture_msgs.srv import GivePulse
 from numpy.typing import NDArray
-from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
 
@@ -35,20 +34,12 @@ from magnetosuture_thread.coils.pulses import IS_OVER, STOOD_STILL
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.needle_arc import heading_angle
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import (
-    DISCOVERY_TIME,
-    POLL_PERIOD,
-    TIMEOUT,
-    CoilClient,
-    Inbox,
-    Latest,
-    Services,
-)
+from magnetosuture_thread.nodes.clients import DISCOVERY_TIME, TIMEOUT, CoilClient, Inbox, Latest, Services
 from magnetosuture_thread.nodes.coil_bridge import PROCESS
-from magnetosuture_thread.nodes.node import read_status
+from magnetosuture_thread.nodes.node import read_report
 from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings.configuration import to_mapping
-from magnetosuture_thread.settings.errors import GraphError, shortened
+from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.interface import Service
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import lens_of
@@ -91,13 +82,11 @@ class LiveBench(CoilClient):
         self._setup, self._check = setup, check
         self._poses: list[tuple[float, Vector]] = []  # stamp and pose
         self._texts: dict[str, tuple[str, dict[str, str]]] = {}  # state of each node, and its values
-        self._before: dict[str, list[ParameterMessage]] = {}  # parameters of nodes that were changed
+        self._before: dict[str, dict[str, Any]] = {}  # parameters of nodes that were changed
         kinds: dict[str, str] = {f"{node}/{name}": kind for node in (BRIDGE, TRACKER) for name, kind in KINDS.items()}
         self._calls = Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
-        self._measured, self._given = (
-            Inbox(self.node, topics.NEEDLE_POSE, 1000),
-            Inbox(self.node, topics.CURRENTS, 1000),
-        )
+        self._measured = Inbox(self.node, topics.NEEDLE_POSE, 1000)
+        self._given = Inbox(self.node, topics.CURRENTS, 1000)
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, 100)
         self._commands = topics.NEEDLE_COMMAND.publisher(self.node)
         try:
@@ -132,14 +121,13 @@ class LiveBench(CoilClient):
         try:
             self.execute("arm")
             while not (square.done or fault or time.monotonic() > end):
-                self._turn()
+                self.turn()
                 for stamp, pose in [entry for entry in self._poses[-8:] if entry[0] > last]:
                     last = stamp
                     velocity = square.command(stamp, pose, self._now() - stamp)
                     self._commands.publish(packed_twist(self.node.get_clock().now().to_msg(), velocity))
-                state = self._state.value
-                if state is not None and state.state == CoilBridgeState.STATE_FAULT:
-                    fault = "; ".join(state.reasons)
+                if self._state.poll() and self._state.value.state == CoilBridgeState.STATE_FAULT:
+                    fault = "; ".join(self._state.value.reasons)
         finally:
             self.execute("disarm")
         return square.result(fault)
@@ -232,21 +220,22 @@ class LiveBench(CoilClient):
             self.execute("disarm")
         for node in [*self._before]:
             with suppress(GraphError):
-                self._restore(node)
+                self._set(node, self._before.pop(node))
 
     def _measure_needle(self) -> float:
         """Return the length of the needle by frames of the camera [m]."""
         settings = self._setup.vision
         topic = topics.COMPRESSED_IMAGE if settings.image_transport == "compressed" else topics.IMAGE
-        camera, images, deadline = Inbox(self.node, topic, 2), list[Any](), time.monotonic() + TIMEOUT
+        camera, images = Inbox(self.node, topic, 2), list[Any]()
         lens = Latest(self.node, topics.CAMERA_INFO, lens_of)
-        while len(images) < FRAMES:
-            self._turn()
+
+        def look() -> bool:
             lens.poll()
             new = [image_of(message) for message, _ in camera.read()]
-            images += new if lens.value is None else [lens.value.undistorted(image) for image in new]
-            if time.monotonic() > deadline:
-                raise GraphError(f"{len(images)} frames of the camera within {TIMEOUT:g} s")
+            images.extend(new if lens.value is None else [lens.value.undistorted(image) for image in new])
+            return len(images) >= FRAMES
+
+        self.wait_for(look, lambda: GraphError(f"{len(images)} frames of the camera within {TIMEOUT:g} s"))
         for inbox in (camera, lens):
             inbox.close()
         return find_needle_length(images, settings, Scene(self._setup.scene.dish))
@@ -291,39 +280,41 @@ class LiveBench(CoilClient):
 
     def _await_end(self, seconds: float) -> tuple[float, float, str]:
         """Return when currents began and ended by the bridge's clock [s], and why."""
-        on, deadline = math.nan, time.monotonic() + seconds + PATIENCE
-        while time.monotonic() < deadline:
+        on, patience = list[float](), seconds + PATIENCE
+
+        def end() -> tuple[float, float, str] | None:
             for message, _ in self._given.read():
                 stamp = 1e-9 * reading.nanoseconds(message.header.stamp)
                 if np.any(message.current):
-                    on = stamp if math.isnan(on) else on
-                elif not math.isnan(on):
-                    return on, stamp, message.stop
-            self._turn()
-        raise GraphError(f"{Service.PULSE}: no end of the currents within {seconds + PATIENCE:g} s")
+                    on.append(stamp)
+                elif on:
+                    return on[0], stamp, message.stop
+            return None
+
+        problem = f"{Service.PULSE}: no end of the currents within {patience:g} s"
+        return self.wait_for(end, lambda: GraphError(problem), patience)
 
     def _await_pose(self, since: float) -> None:
         """Wait for a pose of after a time [s]."""
-        end = max(since, self._now()) + PATIENCE
-        while not (self._poses and self._poses[-1][0] > since):
-            if self._now() > end:
-                reason = self._report(TRACKER)[0]
-                raise InvalidInputError("needle", f"no pose for {PATIENCE:g} s: {reason}", "one in every frame")
-            self._turn()
+
+        def failed() -> InvalidInputError:
+            reason = self._report(TRACKER)[0]
+            return InvalidInputError("needle", f"no pose for {PATIENCE:g} s: {reason}", "one in every frame")
+
+        patience = PATIENCE + max(0.0, since - self._now())
+        self.wait_for(lambda: self._poses and self._poses[-1][0] > since, failed, patience)
 
     def _wait(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            self._turn()
+            self.turn()
 
-    def _turn(self) -> None:
-        """Take what has come."""
+    def turn(self) -> None:
+        """Wait for a moment, and take what has come."""
         self._check()
-        self.spin_some()
-        self._state.poll()
+        super().turn()
         for report, _ in self._reports.read():
-            for status in report.status:
-                self._texts[shortened(status.name.split(":")[0])] = read_status(status)
+            self._texts |= read_report(report)
         for message, _ in self._measured.read():
             with suppress(InvalidInputError):
                 pose = reading.needle_pose(message)
@@ -332,7 +323,6 @@ class LiveBench(CoilClient):
                     last = self._poses[-1][1][2]
                     angle = last + math.remainder(angle - last, math.tau)
                 self._poses.append((pose.stamp, np.array([*pose.tail, angle])))
-        time.sleep(POLL_PERIOD)
 
     def _report(self, node: str) -> tuple[str, dict[str, str]]:
         """Return the state of a node and its values, as it reported them."""
@@ -349,26 +339,19 @@ class LiveBench(CoilClient):
         return answer
 
     def _parameters(self, node: str, *names: str) -> list[Any]:
-        return [parameter_value_to_python(value) for value in self._get(node, *names)]
-
-    def _get(self, node: str, *names: str) -> list[Any]:
-        return list(self._ask(f"{node}/{GET}", GetParameters.Request(names=names)).values)
+        answer = self._ask(f"{node}/{GET}", GetParameters.Request(names=names))
+        return [parameter_value_to_python(value) for value in answer.values]
 
     def _restart(self, node: str, values: Mapping[str, Any]) -> None:
         """Give a node other parameters, by its lifecycle."""
-        names = [name for name in values if name not in {entry.name for entry in self._before.get(node, ())}]
-        kept = [
-            ParameterMessage(name=name, value=value) for name, value in zip(names, self._get(node, *names), strict=True)
-        ]
-        self._before.setdefault(node, []).extend(kept)
-        self._set(node, [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
+        before = dict(zip(values, self._parameters(node, *values), strict=True))
+        self._before[node] = before | self._before.get(node, {})
+        self._set(node, values)
 
-    def _restore(self, node: str) -> None:
-        self._set(node, self._before.pop(node))
-
-    def _set(self, node: str, parameters: list[ParameterMessage]) -> None:
+    def _set(self, node: str, values: Mapping[str, Any]) -> None:
         for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
             self._ask(f"{node}/{CHANGE}", ChangeState.Request(transition=Transition(id=transition)))
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         answer = self._ask(f"{node}/{SET}", SetParametersAtomically.Request(parameters=parameters)).result
         if not answer.successful:
             raise GraphError(f"{node}: {answer.reason}")
@@ -379,18 +362,14 @@ class LiveBench(CoilClient):
 
     def _await_driver(self) -> None:
         """Wait until the bridge can be armed."""
-        deadline = time.monotonic() + TIMEOUT
-        while not self._ready():
-            self._turn()
-            if time.monotonic() > deadline:
-                raise GraphError(f"coil_bridge: {self._report(BRIDGE)[0]}")
 
-    def _ready(self) -> bool:
-        self._state.poll()
-        state = self._state.value
-        return bool(
-            state and state.state == CoilBridgeState.STATE_ACTIVE and state.driver_ready and state.scene_version
-        )
+        def is_ready() -> bool:
+            if not self._state.poll():
+                return False
+            state = self._state.value
+            return state.state == CoilBridgeState.STATE_ACTIVE and bool(state.driver_ready and state.scene_version)
+
+        self.wait_for(is_ready, lambda: GraphError(f"coil_bridge: {self._report(BRIDGE)[0]}"))
 
     def _change(self, node: str, transition: int) -> None:
         """Make a transition of a node.

@@ -181,10 +181,13 @@ class Health:
             self._late.reset()
 
 
-def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
-    """Return message and values of a status, of anybody, with texts of bounded length."""
-    values = {shortened(pair.key): shortened(pair.value, MAX_REASON_CHARS) for pair in status.values[:100]}
-    return shortened(status.message, MAX_REASON_CHARS), values
+def read_report(report: DiagnosticArray) -> dict[str, tuple[str, dict[str, str]]]:
+    """Return message and values of each node in a report, of anybody, by its name, with texts of bounded length."""
+    texts = {}
+    for status in report.status:
+        values = {shortened(pair.key): shortened(pair.value, MAX_REASON_CHARS) for pair in status.values[:100]}
+        texts[shortened(status.name.split(":")[0])] = shortened(status.message, MAX_REASON_CHARS), values
+    return texts
 
 
 class GuardedNode(Node):

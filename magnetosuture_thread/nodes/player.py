@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any, TypeAlias
@@ -19,7 +19,7 @@ from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Participant, listen
 from magnetosuture_thread.nodes.executor import Timeline
-from magnetosuture_thread.nodes.node import read_status
+from magnetosuture_thread.nodes.node import read_report
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 
@@ -37,16 +37,19 @@ Recorded: TypeAlias = Any  # a recorded message: `topic`, `time` [ns] and `data`
 class Losses:
     """Keeps count of a replay.
 
+    Args:
+        arrived: stamps of the outputs that have come, by topic.
+
     Attributes:
         played: messages published, by topic.
         frames_taken: camera frames that the tracker says it has taken.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, arrived: Mapping[str, Mapping[int, float]]) -> None:
         self.played: Counter[str] = Counter()
         self.frames_taken = 0
+        self._arrived = arrived
         self._refused: dict[str, int] = {}
-        self._poses, self._answered = set[int](), set[int]()
         self._numbers: dict[str, int] = {}
         self._taken: Counter[str] = Counter()
 
@@ -56,42 +59,28 @@ class Losses:
         return sum(self.played[channel.name] for channel in interface.CAMERA.values())
 
     @property
-    def frames_waiting(self) -> bool:
-        """Whether the tracker has not taken all frames yet."""
-        return self.frames_taken < self.frames_played
+    def unanswered(self) -> int:
+        """Return how many poses have not been answered yet; one that the model refuses never is."""
+        channels = interface.NEEDLE_POSE, interface.PREDICTED_THREAD, interface.MARGINS
+        poses, *answers = (set(self._arrived.get(channel.name, ())) for channel in channels)
+        return len(poses.difference(*answers))
 
-    @property
-    def poses_waiting(self) -> bool:
-        """Whether a pose has not been answered yet; one that the model refuses never is."""
-        return bool(self._poses - self._answered)
-
-    def heard(self, topic: str, stamp: int | None, number: int | None) -> None:
-        """Count an output of the graph.
-
-        Args:
-            topic: its name.
-            stamp: of the frame that it is about [ns].
-            number: that its publisher gave it, if the middleware tells.
-        """
+    def heard(self, topic: str, number: int | None) -> None:
+        """Count an output of the graph, by the number that its publisher gave it, if the middleware tells."""
         if number is not None and number != topics.UNNUMBERED:
             self._numbers[topic] = max(self._numbers.get(topic, 0), number)
             self._taken[topic] += 1
-        if stamp is not None and topic == interface.NEEDLE_POSE.name:
-            self._poses.add(stamp)
-        if stamp is not None and topic in (interface.PREDICTED_THREAD.name, interface.MARGINS.name):
-            self._answered.add(stamp)
 
     def count_diagnostics(self, data: bytes) -> None:
         """Count a node's status on /diagnostics."""
-        for status in topics.DIAGNOSTICS.decode(data).status:
-            (_, values), node = read_status(status), status.name.split(":")[0]
+        for node, (_, values) in read_report(topics.DIAGNOSTICS.decode(data)).items():
             if node == "vision_tracker":
                 self.frames_taken = max(self.frames_taken, int(values.get("frames", "0")))
             self._refused[node] = int(values.get("refused", "0"))
 
     def dropped(self) -> dict[str, int]:
         """Return how many messages got lost, by the way on which."""
-        unanswered = len(self._poses - self._answered) - self._refused.get("thread_model", 0)
+        unanswered = self.unanswered - self._refused.get("thread_model", 0)
         unheard = sum(max(0, number - self._taken[topic]) for topic, number in self._numbers.items())
         counts = {"poses without an answer": max(0, unanswered), "outputs lost by the recording": unheard}
         if self.frames_played:
@@ -137,9 +126,9 @@ class LiveReplay(Participant):
         self._receive, self._watch, self._log = receive, watch, log
         self._last_answer = time.perf_counter()
         self._still, self._last_clock = timeline.start, 0.0
-        self.losses = Losses()
         self.published: dict[str, dict[int, float]] = defaultdict(dict)
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
+        self.losses = Losses(self.arrived)
         super().__init__("replay", domain=domain)
         self.node.serve(interface.Service.PAUSE_REPLAY, self._on_pause)
         self._clock = self.node.create_publisher(Clock, "/clock", qos_profile_system_default)
@@ -212,7 +201,8 @@ class LiveReplay(Participant):
         """
         self._receive = lambda topic, time, data: None
         while True:
-            self.losses = Losses()
+            self.arrived.clear()
+            self.losses = Losses(self.arrived)
             self.play(records(), lambda time: None)
 
     def _publish(self, publisher: Any, record: Recorded) -> None:
@@ -221,10 +211,8 @@ class LiveReplay(Participant):
         self.losses.played[name] += 1
         if stamp is not None:
             self.published[name][stamp] = now
-        if record.topic in self._echoed:
-            if stamp is not None:
-                self.arrived[name].setdefault(stamp, now)
-            self.losses.heard(name, stamp, None)
+        if record.topic in self._echoed and stamp is not None:
+            self.arrived[name].setdefault(stamp, now)
         if record.topic in (interface.SCENE.recorded, *self._echoed):
             self._receive(record.topic, record.time, bytes(record.data))
 
@@ -233,8 +221,8 @@ class LiveReplay(Participant):
         deadline = self._time.running() + 30.0
         self._last_answer = time.perf_counter()
         while self._time.running() < deadline:
-            enough = STUCK if self.losses.poses_waiting else QUIET
-            if not self.losses.frames_waiting and time.perf_counter() > self._last_answer + enough:
+            enough, losses = STUCK if self.losses.unanswered else QUIET, self.losses
+            if losses.frames_taken >= losses.frames_played and time.perf_counter() > self._last_answer + enough:
                 break
             clock = self._run_clock(clock, clock + CLOCK_PERIOD)
         return clock
@@ -271,7 +259,7 @@ class LiveReplay(Participant):
                 self.arrived[topic.channel.name].setdefault(stamp, info["received_timestamp"] * 1e-9)
             if topic in (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS):
                 self._last_answer = time.perf_counter()
-                self.losses.heard(topic.channel.name, stamp, info["publication_sequence_number"])
+                self.losses.heard(topic.channel.name, info["publication_sequence_number"])
             if topic.channel is interface.DIAGNOSTICS:
                 self.losses.count_diagnostics(data)
             self._receive(topic.channel.recorded, self._time.now(), data)
