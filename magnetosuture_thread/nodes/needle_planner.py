@@ -137,8 +137,6 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
 
     def on_scene(self, scene: Scene) -> None:
         """Go by another scene; a procedure that does not fit it fails."""
-        if self.settings is None:
-            return
         if self.is_active:
             self._rest()
         with self._deaf():

@@ -25,7 +25,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
@@ -212,8 +211,8 @@ class GuardedNode(Node):
         return Health(self)
 
     @property
-    def clock_is_fixed(self) -> bool:
-        """Whether the node keeps the clock that it has: stamps of two clocks cannot be compared."""
+    def is_configured(self) -> bool:
+        """Whether the node goes by what it has: by its scene, and its clock, as stamps of two cannot be compared."""
         return True
 
     @property
@@ -237,7 +236,7 @@ class GuardedNode(Node):
         service: interface.Service,
         callback: Callable[[Any, Any], Any],
         starts: Callable[[Any], bool] = lambda request: False,
-    ) -> Service:
+    ) -> None:
         """Offer a service.
 
         Args:
@@ -254,14 +253,13 @@ class GuardedNode(Node):
         answer = partial(_answer, self.get_logger(), service, in_time)
         offered: Any = self.create_service(topics.ros_class(service.type_name), service, answer)
         offered.sent = 0
-        return offered
 
     def every(self, period: float, callback: Callable[[], None]) -> None:
         """Call back each period [s] of a steady clock: simulated time may stand still."""
         self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[..., None], *arguments: Any, **options: Any
+        self, msg_type: Any, topic: str, callback: Callable[..., object], *arguments: Any, **options: Any
     ) -> Subscription:
         """Subscribe; of /clock, to which rclpy subscribes by itself, only a possible time is passed on."""
         if msg_type is ClockMessage and not options.get("raw"):
@@ -284,7 +282,7 @@ def check_pressed(what: str, pressed: float, now: float) -> None:
         raise InvalidInputError(what, f"a request {now - pressed:.1f} s old", f"at most {interface.PRESS_TIMEOUT:g} s")
 
 
-def _take_clock(node: Callable[[], Any], callback: Callable[[ClockMessage], None], data: bytes) -> None:
+def _take_clock(node: Callable[[], Any], callback: Callable[..., object], data: bytes) -> None:
     def take(message: ClockMessage) -> None:
         reading.clock_nanoseconds(message)
         callback(message)
@@ -293,13 +291,11 @@ def _take_clock(node: Callable[[], Any], callback: Callable[[ClockMessage], None
 
 
 def _check_parameters(reference: Callable[[], Any], parameters: list[Parameter]) -> SetParametersResult:
-    """Refuse a parameter without a name, which rclpy would declare, and another clock for a node that keeps its own."""
-    node = reference()
-    reason, now = "", node.get_parameter("use_sim_time").value
+    """Refuse another clock for a node that keeps its own."""
+    node, reason = reference(), ""
+    now = node.get_parameter("use_sim_time").value
     for parameter in parameters:
-        if not parameter.name:
-            reason = "a parameter without a name"
-        elif parameter.name == "use_sim_time" and node.clock_is_fixed and parameter.value is not now:
+        if parameter.name == "use_sim_time" and node.is_configured and parameter.value is not now:
             reason = str(ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now"))
     return SetParametersResult(successful=not reason, reason=reason)
 
@@ -449,8 +445,8 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         return self.stage == "finalized"
 
     @property
-    def clock_is_fixed(self) -> bool:
-        """Whether the node keeps the clock that it has: while it is configured."""
+    def is_configured(self) -> bool:
+        """Whether the node is configured."""
         return self.settings is not None
 
     def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
@@ -671,8 +667,9 @@ class SceneFollower:
 
     Args:
         node: that subscribes.
-        changed: called with a scene of the topic that is another than the one in force, before it is; raises a
-            `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use it.
+        changed: called while the node is configured, with a scene of the topic that is another than the one in force,
+            before it is; raises a `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use
+            it.
         scene: in force at first; None if it is not known yet.
 
     Attributes:
@@ -710,7 +707,7 @@ class SceneFollower:
         self._heard = None
         try:
             self._heard = scene = parse_scene_message(topics.SCENE.decode(data))
-            if scene.version != self.version:
+            if self._node.is_configured and scene.version != self.version:
                 self._changed(scene)
         except MagnetosutureError as error:
             self.problem = f"scene refused: {shortened(str(error))}"

@@ -55,11 +55,9 @@ class PathFollowerNode(ManagedNode[PathFollowerSettings]):
 
     def on_scene(self, scene: Scene) -> None:
         """Check the path against a new scene; a blocked path is not followed further."""
-        if self.settings is None:
-            return
         self._blocked = ""
         try:
-            self.settings.check_path(scene)
+            self.configured_settings.check_path(scene)
         except ConfigurationError as error:
             self._blocked = str(error)
 

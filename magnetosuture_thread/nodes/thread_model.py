@@ -119,8 +119,7 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
 
     def on_scene(self, scene: Scene) -> None:
         """Change the scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
-        if self.settings is not None:
-            self._session.change(self._session.settings, scene)
+        self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose, or report why that is impossible."""

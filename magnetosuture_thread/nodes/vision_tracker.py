@@ -77,8 +77,8 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         """Look for the needle in another scene."""
         if self._session is not None:
             self._session.set_scene(scene)
-        elif self.settings is not None:
-            self._start_session(self.settings, scene)
+        else:
+            self._start_session(self.configured_settings, scene)
 
     def on_camera_info(self, message: CameraInfo) -> None:
         """Undo the distortion of the camera's lens; frames are taken as they are where its parameters are invalid."""
@@ -87,8 +87,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         except InvalidInputError as error:
             self._lens, self._lens_problem = None, str(error)
             self.refuse(error)
-        if self._session is not None:
-            self._set_lens(self._session)
+        self._set_lens()
 
     def on_tip(self, message: PointStamped) -> None:
         """Take which end of the needle is its tip."""
@@ -107,14 +106,13 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             self.health.warn("; ".join(filter(None, (reason, f"before that {self._text}", self._lens_problem))))
 
     def _start_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> None:
-        self._session = None
-        if scene is not None:
-            self._session = TrackerSession(settings, scene)
-            self._set_lens(self._session)
+        self._session = None if scene is None else TrackerSession(settings, scene)
+        self._set_lens()
 
-    def _set_lens(self, session: TrackerSession) -> None:
+    def _set_lens(self) -> None:
         """Undo the lens's distortion, unless frames come rectified."""
-        session.set_lens(None if interface.is_rectified(self._camera) else self._lens)
+        if self._session is not None:
+            self._session.set_lens(None if interface.is_rectified(self._camera) else self._lens)
 
     def on_image(self, message: Image | CompressedImage) -> None:
         """Track the needle in a frame; its pose is published before the thread is measured."""
