@@ -269,9 +269,13 @@ class Outbox:
 
     A page acknowledges each state and frame. At most `MAX_UNACKNOWLEDGED` of a kind are in flight, so a slow page
     receives fewer of them, and none of them late.
+
+    Attributes:
+        changed: set whenever there may be another message to send.
     """
 
     def __init__(self) -> None:
+        self.changed = asyncio.Event()
         self._replies: deque[str] = deque(maxlen=64)
         self._latest: dict[str, Message] = {}
         self._in_flight = {"state": 0, "frame": 0}
@@ -279,15 +283,18 @@ class Outbox:
     def reply(self, text: str) -> None:
         """Queue a reply; the oldest of too many is dropped."""
         self._replies.append(text)
+        self.changed.set()
 
     def put(self, kind: str, message: Message) -> None:
         """Set the latest `state` or `frame`; it replaces one that was not sent."""
         self._latest[kind] = message
+        self.changed.set()
 
     def acknowledge(self, kind: str) -> bool:
         """Register that the page received a `state` or `frame`; return whether one was in flight."""
         was_in_flight = self._in_flight[kind] > 0
         self._in_flight[kind] -= was_in_flight
+        self.changed.set()
         return was_in_flight
 
     def next(self) -> Message | None:
@@ -391,6 +398,7 @@ class Client:
 
     Attributes:
         address: of the page's computer.
+        outbox: messages to it.
         has_token: whether it has shown the token, with the connection or in its greeting.
         is_script: whether a program commands it, and no person.
     """
@@ -408,14 +416,9 @@ class Client:
         self.is_script = True
         self._socket, self._request, self._settings, self._token = socket, request, settings, token
         self._jog, self._requests = requests.jog, requests
-        self._outbox, self._wake = Outbox(), asyncio.Event()
+        self.outbox = Outbox()
         self._delay, self._last_in_time = DelayEstimator(), 0.0  # arrival of the last message that was not late
         self._rate, self._message_count, self._excess = RateCounter(), 0, 0
-
-    def send_latest(self, kind: str, message: Message) -> None:
-        """Send the latest `state` or `frame` when the page can receive it."""
-        self._outbox.put(kind, message)
-        self._wake.set()
 
     async def serve(self) -> None:
         """Handle messages until the page disconnects; the bridge is disarmed then if the page had control."""
@@ -485,8 +488,7 @@ class Client:
             if exceeded and parsed.request != "stop":
                 raise InvalidInputError("messages", f"{self._message_count} in a second", f"at most {MAX_MESSAGE_RATE}")
             if parsed.type == "acknowledge":
-                self._outbox.acknowledge(parsed.values["kind"])
-                self._wake.set()
+                self.outbox.acknowledge(parsed.values["kind"])
             else:
                 await self._dispatch(parsed, late, now)
         except InvalidInputError as error:
@@ -498,8 +500,7 @@ class Client:
     async def _on_watcher_message(self, kind: WSMsgType, data: Any) -> None:
         """Handle a message of a page without the token: receipts count, all else is not even parsed."""
         text = data[:100] if kind is WSMsgType.TEXT else ""
-        if '"acknowledge"' in text and self._outbox.acknowledge("frame" if '"frame"' in text else "state"):
-            self._wake.set()
+        if '"acknowledge"' in text and self.outbox.acknowledge("frame" if '"frame"' in text else "state"):
             return
         if self._count_message(asyncio.get_running_loop().time()):
             self._abort()  # at once, without the formalities of closing
@@ -561,15 +562,14 @@ class Client:
         self._reply("result", request=request, refusal=refusal)
 
     def _reply(self, kind: str, **fields: Any) -> None:
-        self._outbox.reply(json.dumps({"type": kind, **fields}))
-        self._wake.set()
+        self.outbox.reply(json.dumps({"type": kind, **fields}))
 
     async def _send_all(self) -> None:
         try:
             while True:
-                await self._wake.wait()
-                self._wake.clear()
-                while (message := self._outbox.next()) is not None:
+                await self.outbox.changed.wait()
+                self.outbox.changed.clear()
+                while (message := self.outbox.next()) is not None:
                     socket = self._socket
                     sent = socket.send_str(message) if isinstance(message, str) else socket.send_bytes(message)
                     await asyncio.wait_for(sent, 2.0)  # s; else it does not receive

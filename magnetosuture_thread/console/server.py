@@ -138,7 +138,7 @@ class ConsoleServer:
         self._clients[number] = client
         client.has_token = has_token
         if self._frame:
-            client.send_latest("frame", self._frame)
+            client.outbox.put("frame", self._frame)
         try:
             await socket.prepare(request)
             await client.serve()
@@ -174,7 +174,7 @@ class ConsoleServer:
 
     def _send_all(self, kind: str, message: str | bytes) -> None:
         for client in self._clients.values():
-            client.send_latest(kind, message)
+            client.outbox.put(kind, message)
 
     def _state(self) -> str:
         jog = self._jog
