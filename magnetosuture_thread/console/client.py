@@ -422,11 +422,10 @@ class Client:
 
     async def serve(self) -> None:
         """Handle messages until the page disconnects; the bridge is disarmed then if the page had control."""
-        sending = None
+        if not await self._handshake():
+            return
+        sending = asyncio.create_task(self._send_all())
         try:
-            if not await self._handshake():
-                return
-            sending = asyncio.create_task(self._send_all())
             receive = self._on_message if self.has_token else self._on_watcher_message
             async for message in self._socket:
                 if message.type in (WSMsgType.PING, WSMsgType.PONG):
@@ -439,9 +438,8 @@ class Client:
                 # Nobody is there who would see what the needle does.
                 disarm = ClientMessage("bridge_action", {"action": "disarm"})
                 self._requests.start(self.number, disarm, "nobody", lambda name, refusal: None)
-            if sending is not None:
-                sending.cancel()
-                await asyncio.gather(sending, return_exceptions=True)
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
 
     async def close(self) -> None:
         """Close the connection when the server stops."""
