@@ -84,14 +84,10 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
     if not options.live:
         notes["simulated"] = f"the rig {options.rig or 'of the setup'}, {poses}"
     with _bench(setup, options) as (driven_bench, is_live):
-        how, stops = (
-            {"simulated": not is_live, "poses": notes["rig"], "rig": options.rig or setup.name},
-            folder / STOPS_FILE,
-        )
+        how: dict[str, Any] = {"simulated": not is_live, "poses": notes["rig"], "rig": options.rig or setup.name}
+        stops = folder / STOPS_FILE
         bench = RecordedBench(driven_bench, folder / PULSES, notes)
-        first: dict[str, Any] = (
-            {"check_stops": partial(checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
-        )
+        first = {"check_stops": partial(checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
         radius = setup.scene.dish.radius
         result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, **first).run()
         result = verify_square(result, setup, bench)
