@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.bags.reading import nanoseconds, planar_pose
+from magnetosuture_thread.bags.reading import heading_known, nanoseconds, planar_pose
 from magnetosuture_thread.evaluation.frames import (
     Array,
     CurrentDifference,
@@ -225,7 +225,7 @@ class LoopCollector:
                 self._truth[stamp] = np.array(planar_pose(message.pose))
             case interface.TIP_SETPOINT.recorded:
                 self._setpoints[stamp] = np.array(planar_pose(message.pose))
-            case interface.NEEDLE_POSE.recorded:
+            case interface.NEEDLE_POSE.recorded if heading_known(message):
                 self._tracked[stamp] = np.array(planar_pose(message.pose.pose))
             case interface.TRACKER_STATE.recorded:
                 self._states[stamp] = (message.state, message.processing_time)

@@ -138,9 +138,10 @@ class Loop:
         """Add where the needle really was."""
         self.add("/ground_truth/needle", k, pose=planar(x, 0.0, angle))
 
-    def pose(self, k: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> None:
-        """Add where it was tracked, after 5 ms."""
-        self.add("/needle/measured_cp", k, 5_000_000, pose=Message(pose=planar(x, y, angle)))
+    def pose(self, k: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0, variance: float = 1e-4) -> None:
+        """Add where it was tracked, after 5 ms, with a variance of its heading [rad^2]."""
+        pose = Message(pose=planar(x, y, angle), covariance=[0.0] * 35 + [variance])
+        self.add("/needle/measured_cp", k, 5_000_000, pose=pose)
         self.add("/needle/tracker_state", k, state=1, processing_time=0.004)
 
     def setpoint(self, k: int, x: float = LENGTH, y: float = 0.0) -> None:
@@ -178,6 +179,17 @@ def test_a_pose_far_from_the_truth_is_counted_as_wrong(x: float, angle: float, w
     loop.setpoint(0)
     loop.pose(0, x=x, angle=angle)
     assert loop.collector.summary("x").wrong == wrong
+
+
+def test_an_axis_whose_direction_is_unknown_is_no_wrong_pose():
+    loop = Loop()
+    for k in range(2):
+        loop.truth(k)
+        loop.setpoint(k)
+    loop.pose(0)
+    loop.pose(1, x=LENGTH, angle=math.pi, variance=math.pi**2)
+    summary = loop.collector.summary("x")
+    assert (summary.tracked, summary.wrong, summary.heading_error) == (1, 0, 0.0)
 
 
 def test_only_the_time_of_steering_counts():
