@@ -16,7 +16,7 @@ from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, co
 from magnetosuture_thread.vision.images import middle, sample
 
 STEP_PX = 2.0  # of the walk
-AHEAD = 9  # steps looked ahead, of which five count in full
+AHEAD, SHARES = 9, 5.0 + 4.0 * 0.6  # steps looked ahead, of which five count in full, and what all count
 BENDS, SHARPEST = 31, 0.21  # curvatures tried at each step, up to this [1/px]
 STRONGEST = 1.25  # of the usual strength; above, it counts no more
 ACROSS, ASIDE_PX = 9, 0.5  # samples across a ridge, and the distance between them
@@ -94,15 +94,19 @@ def best_arc(ridge, usual, state):
     bend_cost = 1.1 * (1.0 + 2.0 * (ridge.faintest / usual) ** 2)  # for 1 / px; higher where the thread is faint
     best, best_score = bend, -np.inf
     for index in range(BENDS):
-        part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
+        # From the present one on to both sides in turn, closer together near it.
+        part = ((index + 1) // 2) * (2 * (index % 2) - 1) * 2.0 / (BENDS - 1)
         tried = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
+        price = bend_cost * abs(tried - bend) + 0.15 * abs(tried)
         # The arc as chords: each is the last one turned by the same angle, the first by half of it.
         x, y = u, v
         half, half_sine = math.cos(0.5 * tried * STEP_PX), math.sin(0.5 * tried * STEP_PX)
         across, down = ahead * half - beside * half_sine, beside * half + ahead * half_sine
         cosine, sine = 1.0 - 2.0 * half_sine * half_sine, 2.0 * half * half_sine
-        score, weight = 0.0, 0.0
+        score, left = 0.0, SHARES
         for step in range(AHEAD):
+            if (score + STRONGEST * left) / SHARES - price < best_score:
+                break  # Whatever is ahead, it is not the best.
             x, y = x + across, y + down
             across, down = across * cosine - down * sine, across * sine + down * cosine
             value = min((sample(strength, x, y) - noise) / usual, STRONGEST)
@@ -110,8 +114,8 @@ def best_arc(ridge, usual, state):
                 value = 0.45  # as a hidden pixel counts
             share = 1.0 if step < 5 else 0.6
             score += share * value
-            weight += share
-        score = score / weight - bend_cost * abs(tried - bend) - 0.15 * abs(tried)
+            left -= share
+        score = score / SHARES - price
         if score > best_score:
             best, best_score = tried, score
     return best
