@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, shrunk
+from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, sampled_channel, shrunk
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSettings
 
 COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
@@ -49,6 +50,7 @@ RING_ERROR = 0.01  # of a radius and a centre by a ring of any other look; with 
 NO_DISH = "no dish in the image: show its whole rim in even light, limit the search by region_px, or give its view"
 
 
+@cache
 def unit_vectors(count: int) -> Points:
     """Return unit vectors in directions all around, shape (count, 2)."""
     turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
@@ -739,8 +741,8 @@ class DishWatch:
                 return NO_DISH + (given if self._settings.metres_per_pixel else ""), image
             return "", self.found.prepared(image)
         prepared = self.found.prepared(image)
-        gray, view = measured_channel(prepared), self.found.view
-        shift, rays = rim_shift(gray, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
+        view = self.found.view
+        shift, rays = rim_shift(prepared, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
         if rays >= 0.4 * BINS and shift < 1.0:  # px
             self._anew = []
             return "", prepared
@@ -768,11 +770,11 @@ class DishWatch:
         return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(0.005, slack)
 
 
-def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:
+def rim_shift(image: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:
     """Look quickly whether the rim is where it was.
 
     Args:
-        gray: image, shape (rows, columns), uint8.
+        image: frame, shape (rows, columns) or (rows, columns, 3), uint8.
         centre: the dish's centre [px].
         radius: and its radius [px].
 
@@ -780,13 +782,13 @@ def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> t
         How far the circle through the rim's darkest ring has moved since [px], and how many of the `BINS` rays
         agree on it.
     """
-    edges, darkest = rim_points(gray, centre, radius, 7.0, 1.0, BINS)
+    edges, darkest = rim_points(image, centre, radius, 7.0, 1.0, BINS)
     circle = fit_circle(darkest if len(darkest) >= len(edges) // 2 else edges, 0.5 * AGREEMENT_PX)
     return (math.dist(circle[:2], centre), circle[3]) if circle is not None else (0.0, 0)
 
 
 def rim_points(
-    gray: Gray, centre: tuple[float, float], radius: float, reach: float, step: float, rays: int
+    image: np.ndarray, centre: tuple[float, float], radius: float, reach: float, step: float, rays: int
 ) -> tuple[Points, Points]:
     """Return where rays from a dish's centre meet its rim: its inner edge, and its darkest ring, both of shape (m, 2).
 
@@ -794,7 +796,7 @@ def rim_points(
     plain edge has no such ring.
 
     Args:
-        gray: shape (rows, columns), uint8.
+        image: shape (rows, columns) or (rows, columns, 3), uint8.
         centre: u and v, about [px].
         radius: about [px].
         reach: how far inside and outside of the radius to look [px].
@@ -803,7 +805,7 @@ def rim_points(
     """
     ways, count = unit_vectors(rays), int(2.0 * reach / step)
     radii, places = radius - reach + step * np.arange(count), np.arange(count)
-    profiles = sampled(gray, centre + radii[:, None] * ways[:, None])
+    profiles = sampled_channel(image, centre + radii[:, None] * ways[:, None])
     inside, dark = median(profiles[:, : max(3, count // 8)], axis=1), profiles.min(axis=1)
     half = 0.5 * (inside + dark)
     index = (profiles < half[:, None]).argmax(axis=1)

@@ -264,9 +264,9 @@ def prepare(
     """
     wall = Wall(view.centre_px, dish_radius / view.metres_per_pixel)
     places = _floor_places(image.shape[:2], wall)
+    image = np.ascontiguousarray(image)  # Compiled code is compiled once more for each other layout of memory.
     if image.ndim == 2:
-        # Copied where need be: compiled code is compiled once more for each other layout of memory.
-        both = _layer(np.ascontiguousarray(image), places, mask)
+        both = _layer(image, places, mask)
         return Picture(both, both, view, wall, mask, image)
     one, two, three = cv2.split(image)
     if weights:
@@ -442,6 +442,11 @@ def measured_channel(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image if image.ndim == 2 else cv2.extractChannel(image, 1))
 
 
+def sampled_channel(image: np.ndarray, points: Points) -> NDArray[np.float64]:
+    """Return the channel to measure on at points; of few of them, as to extract the channel takes longer."""
+    return sampled(image, points)[..., 1] if image.ndim == 3 else sampled(image, points)
+
+
 def middle(values: np.ndarray) -> float:
     """Return the median of values of any shape, the upper one of two; numpy's own takes ten times as long."""
     half = values.size // 2
@@ -469,14 +474,10 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
 
     Its shape is (...), for an image with colours (..., colours).
     """
-    if image.ndim == 3:  # of few points
-        left, top = np.maximum(np.floor(points.reshape(-1, 2).min(axis=0)), 0.0).astype(int)
-        right, bottom = np.ceil(points.reshape(-1, 2).max(axis=0)).astype(int) + 2
-        near = cv2.split(image[top : max(top + 2, bottom), left : max(left + 2, right)])
-        return np.stack([sampled(colour, points - (left, top)) for colour in near], axis=-1)
-    values = np.empty(points.shape[:-1])
-    sample_all(np.ascontiguousarray(image), np.ascontiguousarray(points).reshape(-1, 2), values.reshape(-1))
-    return values
+    colours = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
+    values = np.empty((*points.shape[:-1], colours.shape[2]))
+    sample_all(colours, np.ascontiguousarray(points).reshape(-1, 2), values.reshape(-1, colours.shape[2]))
+    return values if image.ndim == 3 else values[..., 0]
 
 
 @compiled_inline
@@ -502,9 +503,11 @@ def within(image, u, v):
 
 @compiled_uncounted
 def sample_all(image, points, values):
-    """Fill in an image at points, shape (m, 2); see `within`."""
-    for index in range(len(points)):
-        values[index] = within(image, points[index, 0], points[index, 1])
+    """Fill in an image with n colours at points, shape (m, 2), its values of shape (m, n); see `within`."""
+    for colour in range(image.shape[2]):
+        plane = image[:, :, colour]
+        for index in range(len(points)):
+            values[index, colour] = within(plane, points[index, 0], points[index, 1])
 
 
 @compiled_uncounted
