@@ -58,8 +58,9 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
     >>> arc_lengths(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 6.0]]))
     array([0., 5., 7.])
     """
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    steps, lengths = points[1:] - points[:-1], np.zeros(len(points))
+    np.cumsum(np.sqrt(np.einsum("ij,ij->i", steps, steps)), out=lengths[1:])
+    return lengths
 
 
 def points_at(points: Points, lengths: NDArray[np.float64]) -> Points:

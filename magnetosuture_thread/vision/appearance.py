@@ -126,7 +126,8 @@ def profiles(gray: Gray, points: Points, aside: Values, tangents: Points | None 
 def respaced(points: Points, spacing: float) -> Points:
     """Return a polyline with vertices of about equal distance."""
     length = float(arc_lengths(points)[-1])
-    return points_at(points, np.linspace(0.0, length, max(2, round(length / spacing) + 1)))
+    steps = max(1, round(length / spacing))
+    return points_at(points, length / steps * np.arange(steps + 1))
 
 
 def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) -> Appearance:

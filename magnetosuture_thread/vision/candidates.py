@@ -56,16 +56,16 @@ class Candidate:
         score: see the module, -1 to 1.
         thing: number of the dark thing that it is in, with all that touches it.
         ends: darkness beyond its first and its last point, 0 to 1.
-        around: the same of what goes on there in any direction ahead.
-        filled: darkness of its first and its last quarter, 0 to 1, where it is in sight.
+        dark: the image that it was found in; see `darkness`.
+        origin: of that in the picture, shape (2,) [px].
     """
 
     arc: Arc
     score: float
     thing: int
     ends: tuple[float, ...]
-    around: tuple[float, ...]
-    filled: tuple[float, ...]
+    dark: NDArray[np.uint8]
+    origin: NDArray[np.int_]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def find_candidates(picture: Picture, size: NeedleSize, prior: Prior | None = No
         away = prior.reach + 0.5 * size.length_px + BORDER * size.width_px
         picture, offset = _part(picture, prior.middle - away, prior.middle + away)
         found = _search(picture, size, replace(prior, middle=prior.middle - offset))
-        return [replace(each, arc=each.arc.shifted(offset)) for each in found]
+        return [replace(each, arc=each.arc.shifted(offset), origin=offset) for each in found]
     return _search(picture, size, None)
 
 
@@ -141,8 +141,7 @@ def _search(picture: Picture, size: NeedleSize, prior: Prior | None) -> list[Can
         if score > MIN_SCORE and inside > MIN_INSIDE and not any(_is_same(state, other, size) for other in found):
             middle = Arc(np.array([u, v]), angle, curvature)
             arc = middle.moved(-0.5 * size.length_px, 0.0, 0.0, 0.0)
-            around, filled = _around_ends(dark, arc, size), _filled_ends(dark, arc, size)
-            found.append(Candidate(arc, score, thing, tuple(ends), around, filled))
+            found.append(Candidate(arc, score, thing, tuple(ends), dark, np.zeros(2, int)))
     return sorted(found, key=lambda candidate: -candidate.score)
 
 
@@ -193,12 +192,15 @@ def is_unique(candidates: list[Candidate], wall: Wall, size: NeedleSize) -> bool
 
     At the wall it may be dark beyond an end.
     """
-    if not candidates or candidates[0].score < SURE_SCORE or min(candidates[0].filled) < MIN_FILLED:
+    if not candidates or candidates[0].score < SURE_SCORE:
         return False
-    first, at = candidates[0], np.array([0.0, 0.5, 1.0]) * size.length_px
-    places = first.arc.at(at)
-    free = np.hypot(*(places[::2] - wall.centre).T) < wall.radius - 2.0 * size.width_px
-    if np.any(free & (np.maximum(first.around, first.ends) > GOES_ON)):
+    first = candidates[0]
+    own = first.arc.shifted(-first.origin)
+    if min(_filled_ends(first.dark, own, size)) < MIN_FILLED:
+        return False
+    ends = first.arc.at(np.array([0.0, size.length_px]))
+    free = np.hypot(*(ends - wall.centre).T) < wall.radius - 2.0 * size.width_px
+    if np.any(free & (np.maximum(_around_ends(first.dark, own, size), first.ends) > GOES_ON)):
         return False
     return all(each.score < UNIQUE * first.score for each in candidates[1:])
 

@@ -40,6 +40,7 @@ from magnetosuture_thread.vision.images import (
     Picture,
     SceneMask,
     glare_mask,
+    greatest_near,
     median,
     middle,
     runs,
@@ -530,10 +531,9 @@ def _clear_shade(ridge: Ridge, picture: Picture, needle: MeasuredNeedle) -> None
     """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
     # A shadow has 12 % of steel's darkness.
     shade = 0.12 * needle.contrast * middle(picture.darkest.floor[::4, ::4])
-    zone = np.zeros_like(ridge.strength)
-    _draw_axis(zone, needle, SHADE_PX, needle.length_px, needle.width_px + 2.0 * SHADE_PX)
-    cv2.bitwise_and(zone, cv2.compare(ridge.strength, shade, cv2.CMP_LT), zone)
-    cv2.copyTo(np.zeros_like(zone), zone, ridge.strength)
+    length, width = needle.length_px, needle.width_px + 2.0 * SHADE_PX
+    box, beside = _axis_area(picture.shape, needle, SHADE_PX, length, width)
+    ridge.strength[box][beside & (ridge.strength[box] < shade)] = 0
 
 
 def _cover_needle(hidden: Gray, needle: MeasuredNeedle) -> None:
@@ -541,13 +541,22 @@ def _cover_needle(hidden: Gray, needle: MeasuredNeedle) -> None:
 
     At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
     """
-    _draw_axis(hidden, needle, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
+    box, covered = _axis_area(hidden.shape, needle, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
+    hidden[box][covered] = 255
 
 
-def _draw_axis(mask: Gray, needle: MeasuredNeedle, first: float, last: float, width: float) -> None:
-    """Draw a part of a needle's axis into a mask, as wide as given [px]."""
-    at = np.round(needle.arc.at(first + (last - first) / 23.0 * np.arange(24.0)) * 16.0).astype(np.int32)
-    cv2.polylines(mask, [at], False, 255, max(1, round(width)), cv2.LINE_8, 4)
+def _axis_area(
+    shape: tuple[int, ...], needle: MeasuredNeedle, first: float, last: float, width: float
+) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+    """Return a box of an image, and which of its pixels a part of a needle's axis covers, as wide as given [px]."""
+    axis = needle.arc.at(first + (last - first) / 23.0 * np.arange(24.0))
+    (left, top), (right, bottom) = (axis.min(axis=0) - width).tolist(), (axis.max(axis=0) + width).tolist()
+    left, top = min(max(int(left), 0), shape[1] - 1), min(max(int(top), 0), shape[0] - 1)
+    right, bottom = max(left + 1, min(int(right), shape[1])), max(top + 1, min(int(bottom), shape[0]))
+    covered = np.zeros((bottom - top, right - left), np.uint8)
+    at = np.round((axis - (left, top)) * 16.0).astype(np.int32)
+    cv2.polylines(covered, [at], False, 1, max(1, round(width)), cv2.LINE_8, 4)
+    return (slice(top, bottom), slice(left, right)), covered.view(np.bool_)
 
 
 def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask, faintest: float) -> int:
@@ -582,22 +591,13 @@ def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask,
     bare &= (rim < (columns - 1 - reach, rows - 1 - reach)).all(axis=1)
     if bare.sum() < 8:
         return len(points)
-    usual = middle(_strongest(ridge, rim[bare], reach))
+    usual = middle(greatest_near(ridge, rim[bare], reach))
     if usual < faintest:
         return len(points)
     # The thread ends where the sum of what speaks for it and against it is greatest: single strong pixels count little.
-    surplus = np.cumsum(np.minimum(_strongest(ridge, points[-run:], 1) / (1.3 * usual) - 1.0, 0.5))
+    surplus = np.cumsum(np.minimum(greatest_near(ridge, points[-run:], 1) / (1.3 * usual) - 1.0, 0.5))
     shown = int(np.argmax(surplus)) + 1 if surplus.max() > 0.0 else 0
     return max(1, len(points) - run + shown)
-
-
-def _strongest(ridge: NDArray[np.uint8], points: Points, reach: int) -> NDArray[np.uint8]:
-    """Return the strongest ridge in a square around each point, shape (m,)."""
-    step = np.arange(-reach, reach + 1)
-    at = np.round(points).astype(np.intp)
-    rows = np.clip(at[:, 1, None] + step, 0, ridge.shape[0] - 1)
-    columns = np.clip(at[:, 0, None] + step, 0, ridge.shape[1] - 1)
-    return np.asarray(ridge[rows[:, :, None], columns[:, None, :]].max(axis=(1, 2)), dtype=np.uint8)
 
 
 def without_needle(layer: Layer, needle: MeasuredNeedle) -> Gray:
@@ -608,12 +608,11 @@ def without_needle(layer: Layer, needle: MeasuredNeedle) -> Gray:
     with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers.
     """
     half, length = 0.5 * needle.width_px + BLOOM_PX, needle.length_px
-    near = np.zeros_like(layer.pixels)
     # Up to two deviations of the blur beside the outline, light of the needle is mixed in.
-    _draw_axis(near, needle, 0.0, length, 2.0 * math.ceil(half + 2.0 * BLUR_PX + 1.0))
-    left, top, width, height = cv2.boundingRect(near)
-    v, u = np.nonzero(near[top : top + height, left : left + width])
-    u, v = u + left, v + top
+    width = 2.0 * math.ceil(half + 2.0 * BLUR_PX + 1.0)
+    (rows, columns), near = _axis_area(layer.pixels.shape, needle, 0.0, length, width)
+    v, u = np.nonzero(near)
+    u, v = u + columns.start, v + rows.start
     s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))
     own = half * (1.0 - (1.0 - THIN) * np.clip((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0, 1.0))
     share = (_edge(own - d) - _edge(-own - d)) * _edge(s) * _edge(length - s)

@@ -77,10 +77,11 @@ def find_needles(
             needles[thing] = found
         else:
             refused.append(found)
-    if not is_unique(candidates, picture.wall, size):
+    is_known = any(each.heading_known for each in needles.values())
+    if is_known or not is_unique(candidates, picture.wall, size):
         return list(needles.values()), refused
     axis = _axis_alone(candidates[0], size)
-    if any(each.heading_known or each.confidence > axis.confidence for each in needles.values()):
+    if any(each.confidence > axis.confidence for each in needles.values()):
         return list(needles.values()), refused
     if picture.mask is not None and _is_inside(picture.mask, axis, size.width_px):
         return [], [*refused, INSIDE]
@@ -127,10 +128,10 @@ def _lies_on(needle: MeasuredNeedle, axis: Arc, size: NeedleSize) -> bool:
 
 def _steel_at(picture: Picture, arc: Arc, size: NeedleSize) -> SteelMap:
     """Return how much of each pixel around an axis is steel, with nothing known beyond the wall and in shapes."""
-    along, aside = np.linspace(0.0, size.length_px, 48), np.array([-0.25, 0.0, 0.25]) * size.width_px
-    points = np.vstack([arc.at(along, np.full(48, offset)) for offset in aside])
+    along, aside = size.length_px / 47.0 * np.arange(48.0), np.array([-0.25, 0.0, 0.25]) * size.width_px
+    points = arc.at(np.tile(along, len(aside)), np.repeat(aside, len(along)))
     steel = SteelMap.around(points, picture, AROUND_PX + TAIL_REACH * size.length_px)
-    steel = steel.hidden_where(picture.wall.distances(steel.box) > picture.wall.radius - RIM_PX)
+    steel = steel.hidden_where(picture.wall.beyond(steel.box, RIM_PX))
     if picture.mask is not None:
         steel = steel.hidden_where(picture.mask.depth[steel.box] > picture.mask.tolerance_px)
     return steel
@@ -153,7 +154,7 @@ def _measured(
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
     """Say whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
-    depths = mask.depths(needle.arc.at(np.linspace(0.0, needle.length_px, 15)))
+    depths = mask.depths(needle.arc.at(needle.length_px / 14.0 * np.arange(15.0)))
     return middle(depths) > mask.tolerance_px - 0.5 * width
 
 
@@ -204,7 +205,7 @@ def _checked(steel: SteelMap, guess: Arc, size: NeedleSize, toward: np.ndarray |
     length_error = 0.5 * (min(size.tolerance, max(SAME_LENGTH, apart)) if agrees else size.tolerance)
     if reason := _what_covers(steel, shown, best):
         return reason
-    if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, 100))) > 0.02:
+    if steel.share_hidden(best.arc, best.length) > 0.02:
         return "hidden"
     if abs(best.arc.curvature) * best.length > size.max_bend + BEND_ERROR:
         return "bent too far"
@@ -493,10 +494,10 @@ def _fading(surely: np.ndarray, fit: TemplateFit) -> float:
 
     Glare over a tail ends it less sharply than lens and sensor do.
     """
-    beyond, across = np.arange(-4.0, 4.1, 0.25), np.linspace(-0.3, 0.3, 5) * fit.width
+    beyond, across = np.arange(-4.0, 4.1, 0.25), np.array([-0.3, -0.15, 0.0, 0.15, 0.3]) * fit.width
     # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
     tail = _fade(beyond, fit.arc.strip(surely, beyond, across).min(axis=1))
-    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
+    body, outside = (0.3 + 0.3 / 11.0 * np.arange(12)) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
     sides = (median(fit.arc.strip(surely, body, side * outside), axis=0) for side in (-1.0, 1.0))
     return tail - min(_fade(-outside, usual) for usual in sides)
 

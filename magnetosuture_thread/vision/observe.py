@@ -225,7 +225,7 @@ def _is_whole(line: Points, length: float) -> bool:
 
 def _outline(needle: MeasuredNeedle, view: DishView) -> Points:
     """Return the outline of a needle in the dish frame, shape (m, 2) [m]."""
-    at, half = np.linspace(0.0, needle.length_px, 9), 0.5 * needle.width_px
+    at, half = needle.length_px / 8.0 * np.arange(9.0), 0.5 * needle.width_px
     return view.to_dish(np.vstack([needle.arc.at(at, half), needle.arc.at(at[::-1], -half)]))
 
 

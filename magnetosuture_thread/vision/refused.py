@@ -64,8 +64,8 @@ def refused_needles(image: np.ndarray, track: Track, scene: Scene, settings: Vis
     mask = scene_mask(scene, small, part.shape, settings.outline_tolerance)
     picture = prepare(part, small, scene.dish.radius, mask, settings.needle_colour)
     share = picture.brightest.pixels / np.maximum(picture.brightest.floor.astype(np.float32), 1.0)
-    away = picture.wall.distances(np.s_[0 : share.shape[0], 0 : share.shape[1]])
-    dark = (share < SEEN) & (away < 0.97 * picture.wall.radius)
+    whole = slice(0, share.shape[0]), slice(0, share.shape[1])
+    dark = (share < SEEN) & ~picture.wall.beyond(whole, 0.03 * picture.wall.radius)
     if mask is not None:
         dark &= mask.depth < -mask.band_px  # an outline looks like a thing
     dark = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner
 from magnetosuture_thread.vision.arc import Arc
-from magnetosuture_thread.vision.images import NEXT, Layer, Picture
+from magnetosuture_thread.vision.images import NEXT, Layer, Picture, greatest_near, nearest
 
 GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
 GLARE_REACH_PX = 4  # around a place, that it is looked for, and over which it fades
@@ -76,22 +76,15 @@ class SteelMap:
         hidden = hidden if self.hidden is None else self.hidden | hidden
         return replace(self, surely=surely, perhaps=perhaps, hidden=hidden)
 
-    def share_hidden(self, points: np.ndarray) -> float:
-        """Return which share of some points, in the map's own pixels, is hidden."""
+    def share_hidden(self, arc: Arc, length: float) -> float:
+        """Return which share of an arc of a length, in the map's own pixels, is hidden."""
         if self.hidden is None:
             return 0.0
-        rows, columns = self.hidden.shape
-        u, v = np.round(points).astype(int).T
-        return float(self.hidden[v.clip(0, rows - 1), u.clip(0, columns - 1)].mean())
+        return float(nearest(self.hidden, arc.at(length / 99.0 * np.arange(100.0))).mean())
 
     def is_glaring(self, points: np.ndarray) -> bool:
         """Say whether the lamp is reflected within a few pixels of points, in the map's own pixels, shape (m, 2)."""
-        rows, columns = self.light.shape
-        reach = np.arange(-GLARE_REACH_PX, GLARE_REACH_PX + 1)
-        u = np.round(points[:, :1]).astype(int) + reach
-        v = np.round(points[:, 1:]).astype(int) + reach
-        near = self.light[v.clip(0, rows - 1)[:, :, None], u.clip(0, columns - 1)[:, None, :]]
-        return float(near.max()) > GLARE
+        return float(greatest_near(self.light, points, GLARE_REACH_PX).max()) > GLARE
 
     def unknown_in_glare(self) -> SteelMap:
         """Return the map in which steel may be anywhere that the lamp is reflected, and at the reflection's edge."""
@@ -114,8 +107,7 @@ class SteelMap:
         right, bottom = np.minimum(points.max(axis=0) + reach, (columns, rows)).astype(int)
         box = slice(top, bottom), slice(left, right)
         dark = _darkness(picture.brightest, box)
-        u, v = np.round(points - (left, top)).astype(int).T
-        own = dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)]
+        own = nearest(dark, points - (left, top))
         rank = round(0.9 * (len(own) - 1))
         depth = float(np.partition(own, rank)[rank])
         surely = _share(dark, depth)
