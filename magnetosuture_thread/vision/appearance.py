@@ -127,7 +127,7 @@ def respaced(points: Points, spacing: float) -> Points:
     """Return a polyline with vertices of about equal distance."""
     length = float(arc_lengths(points)[-1])
     steps = max(1, round(length / spacing))
-    return points_at(points, length / steps * np.arange(steps + 1))
+    return points_at(points, np.asarray(length / steps * np.arange(steps + 1), np.float64))
 
 
 def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) -> Appearance:

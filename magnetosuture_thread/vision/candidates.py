@@ -209,7 +209,7 @@ def _is_same(state: np.ndarray, other: Candidate, size: NeedleSize) -> bool:
     """Say whether an axis by the place (u, v) and the angle of its middle is of what was found."""
     half = 0.5 * size.length_px
     turned = math.remainder(state[2] - other.arc.angle - half * other.arc.curvature, math.pi)
-    return math.dist(state[:2], other.arc.at(half)) < 0.15 * size.length_px and abs(turned) < 0.25
+    return math.dist(state[:2], other.arc.point(half)) < 0.15 * size.length_px and abs(turned) < 0.25
 
 
 def darkness(picture: Picture, size: NeedleSize) -> NDArray[np.uint8]:

@@ -16,6 +16,7 @@ import io
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -263,9 +264,9 @@ def prepare(
     """
     wall = Wall(view.centre_px, dish_radius / view.metres_per_pixel)
     places = _floor_places(image.shape[:2], wall)
-    image = np.ascontiguousarray(image)  # Compiled code is compiled once more for each other layout of memory.
     if image.ndim == 2:
-        both = _layer(image, places, mask)
+        # Copied where need be: compiled code is compiled once more for each other layout of memory.
+        both = _layer(np.ascontiguousarray(image), places, mask)
         return Picture(both, both, view, wall, mask, image)
     one, two, three = cv2.split(image)
     if weights:
@@ -452,9 +453,13 @@ def nearest(image: NDArray[Any], points: Points) -> NDArray[Any]:
 
 def greatest_near(image: NDArray[Any], points: Points, reach: int) -> NDArray[Any]:
     """Return the greatest value of an image up to a reach [px] to all sides of points, shape (m,)."""
-    step = np.arange(-reach, reach + 1)
-    square = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    return np.asarray(nearest(image, np.rint(points)[:, None] + square).max(axis=1))
+    return np.asarray(nearest(image, np.rint(points)[:, None] + _square(reach)).max(axis=1))
+
+
+@cache
+def _square(reach: int) -> Points:
+    """Return the pixels of a square around a place, shape (m, 2) [px]."""
+    return np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - float(reach)
 
 
 def sampled_channel(image: np.ndarray, points: Points) -> NDArray[np.float64]:
@@ -491,9 +496,13 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
 
     Its shape is (...), for an image with colours (..., colours).
     """
-    colours = np.ascontiguousarray(image if image.ndim == 3 else image[..., None])
+    at, colours = np.ascontiguousarray(points).reshape(-1, 2), image if image.ndim == 3 else image[..., None]
+    if not colours.flags.c_contiguous:  # Of a part of a frame no more is copied than the points need.
+        corner = np.minimum(np.maximum(at.min(axis=0), 0.0), np.array(image.shape[1::-1]) - 2.0).astype(int)
+        (left, top), (right, bottom) = corner, np.maximum(at.max(axis=0), corner).astype(int) + 2
+        colours, at = np.ascontiguousarray(colours[top:bottom, left:right]), at - corner
     values = np.empty((*points.shape[:-1], colours.shape[2]))
-    sample_all(colours, np.ascontiguousarray(points).reshape(-1, 2), values.reshape(-1, colours.shape[2]))
+    sample_all(colours, at, values.reshape(-1, colours.shape[2]))
     return values if image.ndim == 3 else values[..., 0]
 
 

@@ -575,7 +575,7 @@ class VisionTracker:
         axis = Arc(view.to_pixels(tail), math.atan2(ahead[1], ahead[0]), self._last.bend / length)
         turn = self._most_turned(after)
         reach = self._reach(after) / view.metres_per_pixel + length * math.sin(0.5 * min(turn, 0.5 * math.pi))
-        return Prior(axis.at(0.5 * length), reach, axis.angle + 0.5 * self._last.bend, turn)
+        return Prior(axis.point(0.5 * length), reach, axis.angle + 0.5 * self._last.bend, turn)
 
     def _most_turned(self, after: float) -> float:
         """Return by how much a needle can have turned off the prediction after a time, 6 degrees of error too [rad]."""

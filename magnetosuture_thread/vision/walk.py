@@ -98,9 +98,12 @@ def best_arc(ridge, usual, state):
         part = ((index + 1) // 2) * (2 * (index % 2) - 1) * 2.0 / (BENDS - 1)
         tried = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
         price = bend_cost * abs(tried - bend) + 0.15 * abs(tried)
+        if STRONGEST - price < best_score:
+            continue
         # The arc as chords: each is the last one turned by the same angle, the first by half of it.
         x, y = u, v
-        half, half_sine = math.cos(0.5 * tried * STEP_PX), math.sin(0.5 * tried * STEP_PX)
+        half_sine = math.sin(0.5 * tried * STEP_PX)
+        half = math.sqrt(1.0 - half_sine * half_sine)  # in half of the time of a cosine
         across, down = ahead * half - beside * half_sine, beside * half + ahead * half_sine
         cosine, sine = 1.0 - 2.0 * half_sine * half_sine, 2.0 * half * half_sine
         score, left = 0.0, SHARES
