@@ -405,9 +405,11 @@ def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> tuple[float, fl
     drawn = drawn_needle(along, aside, fit.length, half, 0.5 * fit.width + BLOOM_PX - half, THIN)
     more = np.maximum(fit.arc.strip(dark, along, aside) - drawn, 0.0)
     outside, beside = int((np.abs(aside) >= half + 0.5).sum()) // 2, int((aside > half + 1.5).sum())
-    across, tip, tail = slice(outside, len(aside) - outside), along > fit.length + 1.0, along < -1.5
-    beyond_tip, beyond_tail = (more[e, across].sum() / max((1.0 - drawn[e, across]).sum(), 1e-9) for e in (tip, tail))
-    body = more[(along > 0.0) & (along < fit.length)]
+    tail, last = np.searchsorted(along, (-1.5, fit.length))
+    first, tip = np.searchsorted(along, (0.0, fit.length + 1.0), "right")
+    ends = np.s_[tip:, outside : len(aside) - outside], np.s_[:tail, outside : len(aside) - outside]
+    beyond_tip, beyond_tail = (more[end].sum() / max((1.0 - drawn[end]).sum(), 1e-9) for end in ends)
+    body = more[first:last]
     sides = [side.min(axis=1, initial=1.0) > 0.5 for side in (body[:, :beside], body[:, len(aside) - beside :])]
     return float(beyond_tip), float(beyond_tail), float(max(side.mean() for side in sides))
 
@@ -443,18 +445,14 @@ def _bluntness(dark: np.ndarray, fit: TemplateFit) -> np.ndarray:
     half = 0.5 * fit.width
     along, aside = _across(fit, half)
     seen = fit.arc.strip(dark, along, aside)
+    middle_row, middle_column = int(np.searchsorted(along, 0.5 * fit.length)), len(aside) // 2
     blunt = drawn_needle(along, aside, fit.length, half, BLOOM_PX, 1.0)
-    forward = drawn_needle(along, aside, fit.length, half, BLOOM_PX, THIN)
-    backward = drawn_needle(fit.length - along, aside, fit.length, half, BLOOM_PX, THIN)
-    result = np.empty((2, 2))
-    for index, (end, tapered) in enumerate(
-        ((along < 0.5 * fit.length, backward), (along >= 0.5 * fit.length, forward))
-    ):
-        weight = blunt - tapered
-        more, total = (weight * (seen - tapered))[end], (weight * weight)[end]
-        for side, beside in enumerate((aside < 0.0, aside > 0.0)):
-            result[index, side] = more[:, beside].sum() / max(total[:, beside].sum(), 1e-9)
-    return result
+    tapered = drawn_needle(np.maximum(along, fit.length - along), aside, fit.length, half, BLOOM_PX, THIN)
+    weight = blunt - tapered
+    more, total = weight * (seen - tapered), weight * weight
+    ends, sides = np.s_[:middle_row, middle_row:], np.s_[:middle_column, middle_column + 1 :]
+    parts = [[(end, side) for side in sides] for end in ends]
+    return np.array([[more[part].sum() / max(total[part].sum(), 1e-9) for part in both] for both in parts])
 
 
 def _thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:

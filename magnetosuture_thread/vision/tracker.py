@@ -616,11 +616,11 @@ def _less_sure(piece: ThreadPiece, dish: FoundDish, radius: float) -> ThreadPiec
 
 def region(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[int, int, int, int]:
     """Return the box of whole cells of the floor's grid around two corners: left, top, right, bottom [px]."""
-    rows, columns = image.shape[:2]
-    last = CELL_PX * (np.array([columns, rows]) // CELL_PX - 1)
-    left, top = np.clip(CELL_PX * np.floor_divide(low, CELL_PX), 0, last).astype(int).tolist()
-    ends = CELL_PX * (np.floor_divide(high, CELL_PX) + 1)
-    right, bottom = np.clip(ends, (left + CELL_PX, top + CELL_PX), (columns, rows)).astype(int).tolist()
+    corners = list[tuple[int, int]]()
+    for begin, end, size in zip(low.tolist(), high.tolist(), image.shape[1::-1], strict=True):
+        first = CELL_PX * min(max(int(begin // CELL_PX), 0), size // CELL_PX - 1)
+        corners.append((first, min(max(CELL_PX * (int(end // CELL_PX) + 1), first + CELL_PX), size)))
+    (left, right), (top, bottom) = corners
     return left, top, right, bottom
 
 
