@@ -234,17 +234,13 @@ def parts_without(line: Strand, gone: Flags) -> list[Strand]:
 
 def first_clear_of(needle: MeasuredNeedle, walk: Points) -> int:
     """Return the first vertex of a walk that lies clear of the needle."""
-    along, aside = needle.arc.coordinates(walk)
-    near = (along > -NEEDLE_PX) & (along < needle.length_px + NEEDLE_PX)
-    near &= np.abs(aside) < 0.5 * needle.width_px + 2.0 * NEEDLE_PX
+    near = needle.near(walk, NEEDLE_PX, NEEDLE_PX, 0.5 * needle.width_px + 2.0 * NEEDLE_PX)
     return len(near) if near.all() else max(1, int(np.argmin(near)))
 
 
 def below_needle(needle: MeasuredNeedle, points: Points) -> Flags:
     """Return which points the needle hides, with its blurred edge."""
-    along, aside = needle.arc.coordinates(points)
-    inside = (along > 1.0) & (along < needle.length_px + NEEDLE_PX)
-    return np.asarray(inside & (np.abs(aside) < 0.5 * needle.width_px + 1.0))
+    return needle.near(points, -1.0, NEEDLE_PX, 0.5 * needle.width_px + 1.0)
 
 
 @dataclass(frozen=True)
@@ -284,21 +280,16 @@ class Hiding:
 def find_hiding(picture: Picture, needle: MeasuredNeedle) -> Hiding:
     """Find what may hide a thread in a picture; the needle is in its pixels."""
     wall = picture.wall
-    rows, columns = picture.shape
     solid = cv2.morphologyEx(glare_mask(picture), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    within = np.zeros((rows, columns), np.uint8)
-    u, v, reach = (round(16.0 * value) for value in (*wall.centre, wall.radius - WALL_PX))
-    cv2.circle(within, (u, v), reach, 1, -1, cv2.LINE_8, 4)
-    inside = within.view(np.bool_)
-    cv2.multiply(solid, within, solid)
+    inside = wall.inside(picture.shape, WALL_PX)
+    cv2.bitwise_and(solid, inside, solid)
     cv2.bitwise_or(solid, _objects(picture, 1e-6 / picture.view.metres_per_pixel**2), solid)  # m^2
     if picture.mask is not None:
         cv2.bitwise_or(solid, cv2.compare(picture.mask.depth, -picture.mask.tolerance_px, cv2.CMP_GT), solid)
-    axis = needle.arc.at(np.linspace(0.0, needle.length_px + NEEDLE_PX, 24))
-    at = np.round(axis * 16.0).astype(np.int32)
-    cv2.polylines(solid, [at], False, 255, max(1, round(needle.width_px + 2.0 * NEEDLE_PX)), cv2.LINE_8, 4)
+    box, covered = needle.area(picture.shape, 0.0, needle.length_px + NEEDLE_PX, needle.width_px + 2.0 * NEEDLE_PX)
+    solid[box][covered] = 255
     _, areas = cv2.connectedComponents(solid, connectivity=8, ltype=cv2.CV_32S)
-    return Hiding(solid, np.asarray(areas, dtype=np.int32), inside, wall)
+    return Hiding(solid, np.asarray(areas, dtype=np.int32), inside > 0, wall)
 
 
 def _objects(picture: Picture, min_area: float) -> Gray:

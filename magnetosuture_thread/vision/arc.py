@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.vision.images import straighten
 
@@ -147,6 +149,24 @@ class MeasuredNeedle:
             covariance = turn @ covariance @ turn.T + np.diag([REVERSED_PX**2, 0.0, 0.0])
         arc = self.arc.reversed_at(self.length_px)
         return replace(self, arc=arc, covariance=covariance, size_measured=False, tail_shift_px=0.0)
+
+    def area(
+        self, shape: tuple[int, ...], first: float, last: float, width: float
+    ) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+        """Return a box of an image, and which of its pixels a part of the axis covers, as wide as given [px]."""
+        axis = self.arc.at(first + (last - first) / 23.0 * np.arange(24.0))
+        (left, top), (right, bottom) = (axis.min(axis=0) - width).tolist(), (axis.max(axis=0) + width).tolist()
+        left, top = min(max(int(left), 0), shape[1] - 1), min(max(int(top), 0), shape[0] - 1)
+        right, bottom = max(left + 1, min(int(right), shape[1])), max(top + 1, min(int(bottom), shape[0]))
+        covered = np.zeros((bottom - top, right - left), np.uint8)
+        at = np.round((axis - (left, top)) * 16.0).astype(np.int32)
+        cv2.polylines(covered, [at], False, 1, max(1, round(width)), cv2.LINE_8, 4)
+        return (slice(top, bottom), slice(left, right)), covered.view(np.bool_)
+
+    def near(self, points: np.ndarray, before: float, beyond: float, half: float) -> NDArray[np.bool_]:
+        """Say which points lie up to some lengths before the tail and beyond the tip, and aside of the axis [px]."""
+        along, aside = self.arc.coordinates(points)
+        return np.asarray((along > -before) & (along < self.length_px + beyond) & (np.abs(aside) < half))
 
     def undirected(self) -> MeasuredNeedle:
         """Return the needle, its tail perhaps where its tip is taken to be."""

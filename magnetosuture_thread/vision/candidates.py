@@ -217,9 +217,7 @@ def darkness(picture: Picture, size: NeedleSize) -> NDArray[np.uint8]:
     pixels, floor = picture.brightest.pixels, picture.brightest.floor
     side = 2 * int(0.5 * CLOSING * size.width_px) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    inside = np.zeros(picture.shape, np.uint8)
-    u, v, reach = (round(16.0 * value) for value in (*picture.wall.centre, picture.wall.radius - RIM_PX))
-    cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
+    inside = picture.wall.inside(picture.shape, RIM_PX)
     shown = cv2.min(pixels, floor)
     cv2.copyTo(floor, cv2.bitwise_not(inside), shown)  # so that what touches the wall is a thing of its own
     light = cv2.blur(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, kernel), (5, 5))

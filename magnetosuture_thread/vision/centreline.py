@@ -361,7 +361,7 @@ def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
     across = other.start - one.start
     curve, chord = joining_curve(one, other), math.atan2(across[1], across[0])
     g = float(arc_lengths(curve)[-1])
-    a, b = _wrapped(one.angle + math.pi - chord), _wrapped(other.angle - chord)
+    a, b = math.remainder(one.angle + math.pi - chord, math.tau), math.remainder(other.angle - chord, math.tau)
     if g < 1.0 or max(abs(a), abs(b)) > 2.0:  # rad from the chord
         return math.inf
     k = -one.curvature
@@ -380,10 +380,6 @@ def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
     bare = g / (len(curve) - 1) * float(np.maximum(0.0, 1.0 - shown).sum())
     differs = (one.strength - other.strength) / (0.3 * stronger)  # by which strengths of one strand differ
     return bend + 0.5 * bare + 0.5 * differs**2
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _beyond(
@@ -496,9 +492,7 @@ def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_le
     wall = picture.wall
     hidden = glare_mask(picture)
     _cover_needle(hidden, needle)
-    inside = np.zeros_like(gray)
-    u, v, reach = (round(16.0 * value) for value in (*wall.centre, wall.radius - RIM_PX))
-    cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
+    inside = wall.inside(picture.shape, RIM_PX)
     # What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
     gray = np.asarray(cv2.copyTo(gray, inside, picture.darkest.floor.copy()), dtype=np.uint8)
     dish = (*wall.centre, wall.radius - WALL_PX)
@@ -532,7 +526,7 @@ def _clear_shade(ridge: Ridge, picture: Picture, needle: MeasuredNeedle) -> None
     # A shadow has 12 % of steel's darkness.
     shade = 0.12 * needle.contrast * middle(picture.darkest.floor[::4, ::4])
     length, width = needle.length_px, needle.width_px + 2.0 * SHADE_PX
-    box, beside = _axis_area(picture.shape, needle, SHADE_PX, length, width)
+    box, beside = needle.area(picture.shape, SHADE_PX, length, width)
     ridge.strength[box][beside & (ridge.strength[box] < shade)] = 0
 
 
@@ -541,22 +535,8 @@ def _cover_needle(hidden: Gray, needle: MeasuredNeedle) -> None:
 
     At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
     """
-    box, covered = _axis_area(hidden.shape, needle, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
+    box, covered = needle.area(hidden.shape, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
     hidden[box][covered] = 255
-
-
-def _axis_area(
-    shape: tuple[int, ...], needle: MeasuredNeedle, first: float, last: float, width: float
-) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-    """Return a box of an image, and which of its pixels a part of a needle's axis covers, as wide as given [px]."""
-    axis = needle.arc.at(first + (last - first) / 23.0 * np.arange(24.0))
-    (left, top), (right, bottom) = (axis.min(axis=0) - width).tolist(), (axis.max(axis=0) + width).tolist()
-    left, top = min(max(int(left), 0), shape[1] - 1), min(max(int(top), 0), shape[0] - 1)
-    right, bottom = max(left + 1, min(int(right), shape[1])), max(top + 1, min(int(bottom), shape[0]))
-    covered = np.zeros((bottom - top, right - left), np.uint8)
-    at = np.round((axis - (left, top)) * 16.0).astype(np.int32)
-    cv2.polylines(covered, [at], False, 1, max(1, round(width)), cv2.LINE_8, 4)
-    return (slice(top, bottom), slice(left, right)), covered.view(np.bool_)
 
 
 def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask, faintest: float) -> int:
@@ -610,7 +590,7 @@ def without_needle(layer: Layer, needle: MeasuredNeedle) -> Gray:
     half, length = 0.5 * needle.width_px + BLOOM_PX, needle.length_px
     # Up to two deviations of the blur beside the outline, light of the needle is mixed in.
     width = 2.0 * math.ceil(half + 2.0 * BLUR_PX + 1.0)
-    (rows, columns), near = _axis_area(layer.pixels.shape, needle, 0.0, length, width)
+    (rows, columns), near = needle.area(layer.pixels.shape, 0.0, length, width)
     v, u = np.nonzero(near)
     u, v = u + columns.start, v + rows.start
     s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))

@@ -193,6 +193,12 @@ class Wall:
     centre: tuple[float, float]
     radius: float
 
+    def inside(self, shape: tuple[int, int], depth: float) -> Gray:
+        """Return which pixels of a picture lie deeper than a depth inside of the wall [px], 255 there."""
+        inside = np.zeros(shape, np.uint8)
+        u, v, reach = (round(16.0 * value) for value in (*self.centre, self.radius - depth))
+        return np.asarray(cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4), dtype=np.uint8)
+
     def beyond(self, box: tuple[slice, slice], depth: float) -> NDArray[np.bool_]:
         """Say which pixels of some rows and columns lie farther out than a depth inside of the wall [px]."""
         rows, columns = box

@@ -121,9 +121,8 @@ def _rough_fits(steel: SteelMap, candidate: Candidate, size: NeedleSize) -> list
 
 def _lies_on(needle: MeasuredNeedle, axis: Arc, size: NeedleSize) -> bool:
     """Say whether most of an axis lies on a needle."""
-    along, aside = needle.arc.coordinates(axis.at(np.linspace(0.1, 0.9, 9) * size.length_px))
-    on = (np.abs(aside) < size.width_px) & (along > -size.width_px) & (along < needle.length_px + size.width_px)
-    return float(on.mean()) > 0.4
+    points, width = axis.at(np.linspace(0.1, 0.9, 9) * size.length_px), size.width_px
+    return float(needle.near(points, width, width, width).mean()) > 0.4
 
 
 def _steel_at(picture: Picture, arc: Arc, size: NeedleSize) -> SteelMap:

@@ -559,7 +559,7 @@ class VisionTracker:
             return False
         after = pose.time - last.time
         tail, angle = last.at(pose.time)
-        turn = abs(_wrapped(pose.angle - angle))
+        turn = abs(math.remainder(pose.angle - angle, math.tau))
         return math.dist(pose.tail, tail) < self._reach(after) and turn < min(self._most_turned(after), 0.5 * math.pi)
 
     def _reach(self, after: float) -> float:
@@ -590,7 +590,8 @@ class VisionTracker:
         if before is not None:
             after = pose.time - before.time
             velocity = before.velocity + SMOOTHING * ((pose.tail - before.tail) / after - before.velocity)
-            turn_rate = before.turn_rate + SMOOTHING * (_wrapped(pose.angle - before.angle) / after - before.turn_rate)
+            turned = math.remainder(pose.angle - before.angle, math.tau)
+            turn_rate = before.turn_rate + SMOOTHING * (turned / after - before.turn_rate)
             velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         direction_is_clear = pose.direction_is_clear or (before is not None and before.direction_is_clear)
@@ -628,10 +629,6 @@ def _pose(needle: MeasuredNeedle, picture: Picture, time: float) -> _Pose:
     heading = picture.view.directions_to_dish(needle.direction_px)
     tail, bend = picture.view.to_dish(needle.tail_edge_px), needle.arc.curvature * needle.length_px
     return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0, needle.direction_is_clear, bend)
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 class RepetitionDetector:
