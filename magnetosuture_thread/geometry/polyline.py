@@ -58,7 +58,7 @@ def arc_lengths(points: Points) -> NDArray[np.float64]:
     >>> arc_lengths(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 6.0]]))
     array([0., 5., 7.])
     """
-    steps, lengths = points[1:] - points[:-1], np.zeros(len(points))
+    steps, lengths = np.diff(points, axis=0), np.zeros(max(1, len(points)))
     np.cumsum(np.sqrt(np.einsum("ij,ij->i", steps, steps)), out=lengths[1:])
     return lengths
 
