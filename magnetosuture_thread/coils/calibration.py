@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +16,22 @@ import yaml
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import CoilProperties, loop_fields
-from magnetosuture_thread.settings.configuration import from_mapping, read_yaml, to_mapping
+from magnetosuture_thread.settings.configuration import (
+    Quantity,
+    bounded,
+    configuration_fields,
+    errors_of_file,
+    from_mapping,
+    read_yaml,
+    to_mapping,
+)
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
 
 MODEL = "loops"  # of the field of a coil
 MIN_COILS = 3  # needed to pull in every direction
 TEXT_KEYS = ("name", "date", "notes")
-REQUIRED_KEYS = ("name", "angle", "distance", "radius", "field_per_current")
+PARAMETERS = ("angle", "distance", "radius", "field_per_current")  # of a coil
 
 
 @dataclass(frozen=True)
@@ -50,7 +60,7 @@ class CoilCalibration:
         coils = []
         for coil in self.coils:
             named = {k: float(f"{v:.8g}") if isinstance(v, float) else v for k, v in to_mapping(coil).items()}
-            coils.append({key: value for key, value in named.items() if key in REQUIRED_KEYS or value})
+            coils.append({key: value for key, value in named.items() if key in ("name", *PARAMETERS) or value})
         return header + yaml.safe_dump({**head, "coils": coils}, sort_keys=False, allow_unicode=True)
 
 
@@ -61,55 +71,57 @@ def read_calibration(path: Path) -> CoilCalibration:
         ConfigurationError: the file is unreadable or no YAML, a key is missing or unknown, or a value has the wrong
             type or is out of bounds; with file, key, value and expectation.
     """
-    content, source = read_yaml(path, "coil calibration"), str(path)
-    known = (*TEXT_KEYS, "model", "coils")
-    if not isinstance(content, Mapping):
-        raise ConfigurationError("coil calibration", content, f"keys {', '.join(known)}", source)
-    for key, value in content.items():
-        if key not in known:
-            raise ConfigurationError(str(key), value, f"one of {', '.join(known)}", source)
-        if key in TEXT_KEYS and not isinstance(value, str):
-            raise ConfigurationError(key, value, "text", source)
-    if content.get("model", MODEL) != MODEL:
-        expected = f"{MODEL}, the only model; calibrate the coils again"
-        raise ConfigurationError("model", content["model"], expected, source)
-    listed = content.get("coils")
-    if not isinstance(listed, list) or len(listed) < MIN_COILS:
-        given = f"{len(listed)} coils" if isinstance(listed, list) else listed
-        raise ConfigurationError("coils", given, f"a list of at least {MIN_COILS} coils", source)
-    coils: list[CoilProperties] = []
-    for index, values in enumerate(listed):
-        where, needed = f"coils[{index}]", ", ".join(REQUIRED_KEYS)
-        if not isinstance(values, Mapping):
-            raise ConfigurationError(where, values, f"keys {needed}", source)
-        for key in REQUIRED_KEYS:
-            if key not in values:
-                raise ConfigurationError(f"{where}.{key}", None, f"a value: {needed} are needed", source)
-        try:
-            coils.append(from_mapping(CoilProperties, {str(key): value for key, value in values.items()}))
-        except ConfigurationError as error:
-            name = error.name.replace(CoilProperties.GROUP, where, 1)
-            raise ConfigurationError(name, error.value, error.expectation, source) from None
-        if coils[-1].name in [coil.name for coil in coils[:-1]]:
-            expected = "a name of its own for each"
-            raise ConfigurationError("coils", f"two of the name {coils[-1].name}", expected, source)
-    return CoilCalibration(coils=tuple(coils), **{key: content.get(key, "") for key in TEXT_KEYS})
+    content, known = read_yaml(path, "coil calibration"), (*TEXT_KEYS, "model", "coils")
+    with errors_of_file(str(path)):
+        if not isinstance(content, Mapping):
+            raise ConfigurationError("coil calibration", content, f"keys {', '.join(known)}")
+        for key, value in content.items():
+            if key not in known:
+                raise ConfigurationError(str(key), value, f"one of {', '.join(known)}")
+            if key in TEXT_KEYS and not isinstance(value, str):
+                raise ConfigurationError(key, value, "text")
+        if content.get("model", MODEL) != MODEL:
+            raise ConfigurationError("model", content["model"], f"{MODEL}, the only model; calibrate the coils again")
+        listed = content.get("coils")
+        if not isinstance(listed, list) or len(listed) < MIN_COILS:
+            given = f"{len(listed)} coils" if isinstance(listed, list) else listed
+            raise ConfigurationError("coils", given, f"a list of at least {MIN_COILS} coils")
+        coils = tuple(_coil_from(f"coils[{index}]", values) for index, values in enumerate(listed))
+        for name, count in Counter(coil.name for coil in coils).items():
+            if count > 1:
+                raise ConfigurationError("coils", f"two of the name {name}", "a name of its own for each")
+    return CoilCalibration(coils=coils, **{key: content.get(key, "") for key in TEXT_KEYS})
+
+
+def _coil_from(where: str, values: Any) -> CoilProperties:
+    needed = ("name", *PARAMETERS)
+    if not isinstance(values, Mapping):
+        raise ConfigurationError(where, values, f"keys {', '.join(needed)}")
+    for key in needed:
+        if key not in values:
+            raise ConfigurationError(f"{where}.{key}", None, f"a value: {', '.join(needed)} are needed")
+    try:
+        return from_mapping(CoilProperties, {str(key): value for key, value in values.items()})
+    except ConfigurationError as error:
+        raise ConfigurationError(error.name.replace("coil", where, 1), error.value, error.expectation) from None
 
 
 Array = NDArray[np.float64]
 
-COLUMNS = ("coil", "current", "x", "y", "bx", "by")
-# Values out of these bounds are assumed to have another unit.
-VALUE_BOUNDS = {"current": (1000.0, "A"), "x": (0.5, "m"), "y": (0.5, "m"), "bx": (1.0, "T"), "by": (1.0, "T")}
+# Of the numbers of a line; beyond, they are assumed to have another unit.
+QUANTITIES = {
+    "current": bounded("A", -1000.0, 1000.0),
+    **dict.fromkeys(("x", "y"), bounded("m", -0.5, 0.5)),
+    **dict.fromkeys(("bx", "by"), bounded("T", -1.0, 1.0)),
+}
+COLUMNS = ("coil", *QUANTITIES)
 MAX_COILS = 64
 MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
 MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
-RADIUS_BOUNDS = (0.002, 0.5)  # m
-PARAMETERS = ("angle", "distance", "radius", "field_per_current")
-# Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
-# unidentifiable. The field hardly depends on the radius, which has no such limit.
-POOR_DEVIATION = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_current": 0.02}
-MAX_DEVIATION = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
+# Standard deviations, of the angle in rad, of the others relative, in the order of `PARAMETERS`: above, a parameter is
+# poorly determined, or unidentifiable. The field hardly depends on the radius, which has no such limit.
+POOR_DEVIATION = (0.02, 0.1, 0.25, 0.02)
+MAX_DEVIATION = (0.3, 1.0, math.inf, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +180,10 @@ def read_measurements(path: Path) -> ProbeMeasurements:
         if len(cells) != len(COLUMNS):
             raise InvalidInputError(where, f"{len(cells)} values", f"{len(COLUMNS)}: {','.join(header)}")
         values = dict(zip(header, cells, strict=True))
-        if not values["coil"]:
+        if not (name := values.pop("coil")):
             raise InvalidInputError(f"{where}, coil", "nothing", "index or name of the coil that is on")
-        named.append(f"coil_{int(values['coil'])}" if _is_index(values["coil"]) else values["coil"])
-        numbers.append([_number(f"{where}, {column}", values[column], column) for column in COLUMNS[1:]])
+        named.append(f"coil_{int(name)}" if _is_index(name) else name)
+        numbers.append([_number(f"{where}, {column}", values[column], QUANTITIES[column]) for column in QUANTITIES])
     names, table = _ordered_names(named, path), np.array(numbers)
     coil, at = np.array([names.index(name) for name in named]), np.array([number for _, number, _ in rows[1:]])
     return ProbeMeasurements(str(path), names, coil, table[:, 0], table[:, 1:3], table[:, 3:], at)
@@ -181,15 +193,11 @@ def _is_index(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) < 4
 
 
-def _number(where: str, text: str, column: str) -> float:
-    limit, unit = VALUE_BOUNDS[column]
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= limit:
-        raise InvalidInputError(where, text or "nothing", f"a number from {-limit:g} to {limit:g} {unit}")
-    return value
+def _number(where: str, text: str, limits: Quantity) -> float:
+    with suppress(ValueError):
+        if limits.within(value := float(text)):
+            return value
+    raise InvalidInputError(where, text or "nothing", limits.expectation(float))
 
 
 def _ordered_names(named: list[str], path: Path) -> tuple[str, ...]:
@@ -229,25 +237,6 @@ class CalibrationFit:
     worst: tuple[int, float]
     readings: int
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        coils = [
-            {
-                **{key: getattr(coil, key) for key in ("name", *PARAMETERS, "residual")},
-                "deviations": dict(zip(PARAMETERS, row, strict=True)),
-                "poor": list(poor),
-            }
-            for coil, row, poor in zip(self.calibration.coils, self.deviations.tolist(), self.poor, strict=True)
-        ]
-        return {
-            "model": MODEL,
-            "coils": coils,
-            "background": self.background.tolist(),
-            "residual": self.residual,
-            "worst": self.worst,
-            "readings": self.readings,
-        }
-
 
 def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
     """Fit coils as loops of current, and a background, to measurements.
@@ -255,7 +244,7 @@ def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
         min  sum | B_0 + I_i b(p_i; angle, distance, radius, field) - B_i |^2
 
     over four numbers of each coil and the background B_0 of earth and probe, which is
-    the same in all. First coil by coil, from several starts and both polarities, then all at once. The
+    the same in all. Each coil starts on the side to which its own field grows. The
     standard deviations are those of least squares, s^2 (J^T J)^-1, with the scatter s of the residuals.
 
     Args:
@@ -267,26 +256,54 @@ def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
 
     Source: none; nonlinear least squares by scipy, trust region reflective.
     """
+    from scipy.optimize import least_squares  # here, as whoever reads a calibration alone need not wait for it
+
     _check_readings(data)
-    size = float(np.sqrt(np.mean(data.field[data.current != 0.0] ** 2)))
+    count, size = len(data.names), float(np.sqrt(np.mean(data.field[data.current != 0.0] ** 2)))
     off = data.field[data.current == 0.0]
     background = off.mean(axis=0) if len(off) else np.zeros(2)
-    starts = [_start(data, index, background, size) for index in range(len(data.names))]
-    found = _solve(data, np.arange(len(data.names)), size, [np.concatenate([*starts, background / size])])
+    start = np.concatenate([*(_start(data, index, background, size) for index in range(count)), background / size])
+    limits = {setting.name: setting.quantity for setting in configuration_fields(CoilProperties)}
+    # A coil is beyond all points, and where and as large as one may be.
+    nearest = max(limits["distance"].minimum, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
+    farthest, radii = max(limits["distance"].maximum, 2.0 * nearest), limits["radius"]
+    low = [-math.inf, math.log(nearest), math.log(radii.minimum), -math.inf] * count + [-math.inf] * 2
+    high = [math.inf, math.log(farthest), math.log(radii.maximum), math.inf] * count + [math.inf] * 2
+
+    def residuals(x: Array) -> Array:
+        """Return the differences in units of the field's size, of numbers of order one; see `_start`."""
+        angle, distance, radius, strength = x[:-2].reshape(-1, 4).T[:, data.coil]
+        axis = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-axis[:, 1], axis[:, 0]])
+        along, aside = np.sum(data.points * axis, axis=1), np.sum(data.points * across, axis=1)
+        axial, outwards = loop_fields(along, aside, np.exp(distance), np.exp(radius), strength)
+        of_coil = data.current[:, None] * (axial[:, None] * axis + outwards[:, None] * across)
+        return np.asarray((x[-2:] + of_coil - data.field / size).ravel())
+
+    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12)
+    options: dict[str, Any] = {"jac": "3-point", "bounds": (low, high), "x_scale": "jac", **tolerances}
+    found = least_squares(residuals, np.clip(start, low, high), max_nfev=300, **options)
     difference = size * found.fun.reshape(-1, 2)
     residual = float(np.sqrt(np.mean(difference**2)))
     # A residual of more than a quarter of the measured field means other coils.
     if residual > 0.25 * size:
         given = f"a field that differs from the model's by {residual / size:.0%}"
         raise InvalidInputError(data.source, given, "one coil on at a time, in the dish frame, in SI units")
-    coils = [_coil(data, index, found.x, size, difference) for index in range(len(data.names))]
-    deviations = _deviations(data, coils, found.jac, size, residual / size)
+    coils = tuple(_coil(data, index, found.x, size, difference) for index in range(count))
+    sizes = np.array([[1.0, coil.distance, coil.radius, abs(coil.field_per_current)] for coil in coils])
+    shares = _deviations(data, np.asarray(found.jac), residual / size)
+    shares[:, 3] *= size / sizes[:, 3]
+    for coil, share in zip(coils, shares, strict=True):
+        if unknown := _exceeding(share, MAX_DEVIATION):
+            words = "readings that determine it: all over the dish, with a field well above the probe's noise"
+            raise InvalidInputError(f"{data.source}, {coil.name}", f"an unknown {' and '.join(unknown)}", words)
+    poor = tuple(_exceeding(share, POOR_DEVIATION) for share in shares)
     distances = np.linalg.norm(difference, axis=1)
     worst = int(np.argmax(distances))
     return CalibrationFit(
-        CoilCalibration("", "", "", tuple(coils)),
-        deviations,
-        tuple(_exceeding(coil, row, POOR_DEVIATION) for coil, row in zip(coils, deviations, strict=True)),
+        CoilCalibration("", "", "", coils),
+        shares * sizes,
+        poor,
         size * found.x[-2:],
         residual,
         (int(data.lines[worst]), float(distances[worst])),
@@ -306,60 +323,20 @@ def _check_readings(data: ProbeMeasurements) -> None:
         raise InvalidInputError(f"{data.source}, bx and by", "less than 1e-6 T everywhere", "the field of coils in T")
 
 
-def _solve(
-    data: ProbeMeasurements, coils: NDArray[np.int64], size: float, starts: list[Array], background: Array | None = None
-) -> Any:
-    """Return the best least-squares fit of some of the coils, from several starts, in numbers of order one.
-
-    The numbers are, for each coil, angle, log distance, log radius and field / size; then the background / size, unless
-    that is given, as one coil alone might not tell it from its own field. Residuals are in units of the field's size.
-    """
-    from scipy.optimize import least_squares  # here, as whoever reads a calibration alone need not wait for it
-
-    rows = np.flatnonzero(np.isin(data.coil, coils))
-    of, points, current = np.searchsorted(coils, data.coil[rows]), data.points[rows], data.current[rows, None]
-    field = data.field[rows] / size
-    # A coil is beyond all points, and at most 1 m away.
-    nearest = max(0.01, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
-    low = [-np.inf, math.log(nearest), math.log(RADIUS_BOUNDS[0]), -np.inf] * len(coils)
-    high = [np.inf, math.log(max(1.0, 2.0 * nearest)), math.log(RADIUS_BOUNDS[1]), np.inf] * len(coils)
-    if background is None:
-        low, high = [*low, -np.inf, -np.inf], [*high, np.inf, np.inf]
-
-    def residuals(x: Array) -> Array:
-        angle, distance, radius, strength = x[: 4 * len(coils)].reshape(-1, 4).T[:, of]
-        axis = np.column_stack([np.cos(angle), np.sin(angle)])
-        across = np.column_stack([-axis[:, 1], axis[:, 0]])
-        along, aside = np.sum(points * axis, axis=1), np.sum(points * across, axis=1)
-        axial, outwards = loop_fields(along, aside, np.exp(distance), np.exp(radius), strength)
-        of_coil = current * (axial[:, None] * axis + outwards[:, None] * across)
-        return np.asarray(((x[-2:] if background is None else background / size) + of_coil - field).ravel())
-
-    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12 if background is None else 1e-5)
-    options: dict[str, Any] = {"jac": "3-point", "bounds": (low, high), "x_scale": "jac", **tolerances}
-    found = [least_squares(residuals, np.clip(start, low, high), max_nfev=300, **options) for start in starts]
-    return min(found, key=lambda solution: float(solution.cost))
-
-
 def _start(data: ProbeMeasurements, index: int, background: Array, size: float) -> Array:
-    """Return initial parameters of a coil from its own readings, without the background."""
+    """Return angle, log distance, log radius and field / size of a coil, roughly, by its own readings."""
     on = (data.coil == index) & (data.current != 0.0)
     points, per_current = data.points[on], (data.field[on] - background) / data.current[on, None]
-    # Field and gradient at the centre by a straight line, and how fast the field grows along itself.
+    # Field and gradient at the centre by a straight line, and how fast the field grows along itself: towards the coil.
     reach = max(1e-6, float(np.abs(points).max()))
     line = np.linalg.lstsq(np.column_stack([np.ones(len(points)), points / reach]), per_current, rcond=None)[0]
     strength = max(float(np.linalg.norm(line[0])), 1e-9)
     along = line[0] / strength
-    growth = abs(float(along @ (line[1:].T / reach) @ along)) / strength
-    distance = 2.5 / max(growth, 2.5)  # a dipole's is 3 / distance, a loop's a little less
-    angle = math.atan2(along[1], along[0])
-    starts = [
-        np.array([turned, math.log(share * distance), math.log(0.5 * share * distance), sign * strength / size])
-        # Initial distances, relative to that by the field's gradient.
-        for share in (1.0, 0.5, 2.0)
-        for turned, sign in ((angle, 1.0), (angle + math.pi, -1.0))
-    ]
-    return np.asarray(_solve(data, np.array([index]), size, starts, background).x)
+    growth = float(along @ (line[1:].T / reach) @ along) / strength
+    distance = 2.5 / max(abs(growth), 2.5)  # a dipole's is 3 / distance, a loop's a little less
+    sign = math.copysign(1.0, growth)
+    angle = math.atan2(sign * along[1], sign * along[0])
+    return np.array([angle, math.log(distance), math.log(0.5 * distance), sign * strength / size])
 
 
 def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference: Array) -> CoilProperties:
@@ -377,40 +354,26 @@ def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference
             data.names[index], wrapped, math.exp(distance), math.exp(radius), float(field) * size, residual=residual
         )
     except ConfigurationError as error:
-        name = error.name.replace(CoilProperties.GROUP, data.names[index], 1)
+        name = error.name.replace("coil", data.names[index], 1)
         raise InvalidInputError(f"{data.source}, {name}", error.value, error.expectation) from None
 
 
-def _deviations(
-    data: ProbeMeasurements, coils: list[CoilProperties], jacobian: Array, size: float, residual: float
-) -> Array:
-    """Return standard deviations, shape (m, 4); reject unidentifiable parameters."""
+def _deviations(data: ProbeMeasurements, jacobian: Array, residual: float) -> Array:
+    """Return standard deviations of the numbers of `_start`, shape (m, 4); reject unidentifiable parameters."""
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, values, turned = np.linalg.svd(jacobian / scale, full_matrices=False)
-    labels = [f"{coil.name}.{name}" for coil in coils for name in PARAMETERS] + ["background x", "background y"]
     # Below this ratio of singular values of the scaled Jacobian, parameters are unidentifiable.
     if values[-1] < 1e-6 * values[0]:
-        weights = np.abs(turned[-1])
-        mixed = [label for label, weight in zip(labels, weights, strict=True) if weight > 0.3]
+        labels = [f"{coil}.{name}" for coil in data.names for name in PARAMETERS] + ["background x", "background y"]
+        mixed = [label for label, weight in zip(labels, np.abs(turned[-1]), strict=True) if weight > 0.3]
         words = "readings that tell them apart: all over the dish, and some without current"
         raise InvalidInputError(data.source, f"nothing that tells {', '.join(mixed)}", words)
     count, parameters = jacobian.shape
     scatter = residual * math.sqrt(count / max(1, count - parameters))
     deviations = scatter * np.linalg.norm(turned.T / values, axis=1) / scale
-    shaped = deviations[:-2].reshape(-1, 4) * np.array([[1.0, coil.distance, coil.radius, size] for coil in coils])
-    for coil, row in zip(coils, shaped, strict=True):
-        unknown = _exceeding(coil, row, MAX_DEVIATION)
-        if unknown:
-            words = "readings that determine it: all over the dish, with a field well above the probe's noise"
-            raise InvalidInputError(f"{data.source}, {coil.name}", f"an unknown {' and '.join(unknown)}", words)
-    return np.asarray(shaped)
+    return np.asarray(deviations[:-2].reshape(-1, 4))
 
 
-def _exceeding(coil: CoilProperties, deviations: Array, limits: dict[str, float]) -> tuple[str, ...]:
-    """Return the parameters whose standard deviation exceeds its limit."""
-    sizes = {name: 1.0 if name == "angle" else abs(getattr(coil, name)) for name in PARAMETERS}
-    return tuple(
-        name
-        for name, deviation in zip(PARAMETERS, deviations.tolist(), strict=True)
-        if deviation > limits[name] * sizes[name]
-    )
+def _exceeding(shares: Array, limits: Sequence[float]) -> tuple[str, ...]:
+    """Return the parameters of a coil whose standard deviation, as a share but of the angle, exceeds its limit."""
+    return tuple(name for name, share, most in zip(PARAMETERS, shares, limits, strict=True) if share > most)

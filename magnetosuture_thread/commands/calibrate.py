@@ -14,7 +14,7 @@ from typing import Any
 from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError, calibrate_bags
-from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
+from magnetosuture_thread.coils.calibration import MODEL, PARAMETERS, CalibrationFit, fit_calibration, read_measurements
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.track import open_frames
 from magnetosuture_thread.settings.errors import BagError, one_line
@@ -226,34 +226,27 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal)
     calibration = replace(fit.calibration, notes=f"{notes}, background {x:.2e}, {y:.2e} T", **named)
     with whole_file(options.output) as partial:
         partial.write_text(calibration.to_yaml(), encoding="utf-8")
-    figures = replace(fit, calibration=calibration).to_json()
-    terminal.print(_coil_table(figures))
-    line, worst = figures["worst"]
+    terminal.print(_coil_table(fit))
+    line, worst = fit.worst
     residual = f"{fit.readings} readings, residual {1e6 * fit.residual:.1f} µT"
     terminal.log(f"{residual}, background {1e6 * x:.1f}, {1e6 * y:.1f} µT")
     terminal.log(f"the largest difference, {1e6 * worst:.1f} µT, is in line {line}")
-    for coil in figures["coils"]:
-        if coil["poor"]:
-            terminal.log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")
+    for coil, poor in zip(calibration.coils, fit.poor, strict=True):
+        if poor:
+            terminal.log(f"{coil.name}: poorly determined {', '.join(poor)}; measure all over the dish")
     terminal.log(f"calibration: {options.output}")
     return command.DONE
 
 
-def _coil_table(fit: dict[str, Any]) -> Table:
-    """Return a row for each coil, as `CalibrationFit.to_json` gives them."""
+def _coil_table(fit: CalibrationFit) -> Table:
+    """Return a row for each coil."""
     names = ("coil", "angle [deg]", "distance [mm]", "radius [mm]", "field [mT/A]", "residual [uT]")
-    columns = (("angle", math.degrees(1.0), 2), ("distance", 1e3, 2), ("radius", 1e3, 2), ("field_per_current", 1e3, 4))
-    rows = [
-        (coil["name"], *(_value(coil, *column) for column in columns), f"{1e6 * coil['residual']:.1f}")
-        for coil in fit["coils"]
-    ]
-    caption = "with standard deviations; ? is poorly determined"
-    return command.make_table(f"coils as {fit['model']}", names, rows, caption)
-
-
-def _value(coil: dict[str, Any], key: str, scale: float, digits: int) -> str:
-    deviation = coil["deviations"][key]
-    if math.isnan(deviation):
-        return "-"
-    mark = " ?" if key in coil["poor"] else ""
-    return f"{scale * coil[key]:.{digits}f} ± {scale * deviation:.{digits}f}{mark}"
+    shown = ((math.degrees(1.0), 2), (1e3, 2), (1e3, 2), (1e3, 4))  # factor and digits of each parameter
+    rows = []
+    for coil, deviations, poor in zip(fit.calibration.coils, fit.deviations.tolist(), fit.poor, strict=True):
+        cells = [
+            f"{factor * getattr(coil, name):.{digits}f} ± {factor * deviation:.{digits}f}" + " ?" * (name in poor)
+            for name, deviation, (factor, digits) in zip(PARAMETERS, deviations, shown, strict=True)
+        ]
+        rows.append((coil.name, *cells, f"{1e6 * coil.residual:.1f}"))
+    return command.make_table(f"coils as {MODEL}", names, rows, "with standard deviations; ? is poorly determined")
