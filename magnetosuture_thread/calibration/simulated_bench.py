@@ -20,7 +20,7 @@ from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.pulses import MotionGuard, guard_reach
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.scene import Scene
-from magnetosuture_thread.rig.closed_loop import LATENCY, START
+from magnetosuture_thread.rig.closed_loop import LATENCY, POSE_NOISE, START
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.rig.truth import bare_rig
@@ -28,9 +28,6 @@ from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInpu
 from magnetosuture_thread.vision.tracker import State, TrackerSession
 
 Vector = NDArray[np.float64]
-
-POSE_TIMEOUT = 0.3  # s; age of the last pose, beyond which a pulse ends
-POSE_NOISE = np.array([1e-5, 1e-5, 5e-3])  # m, m and rad; of a tracked needle, where none is rendered
 
 
 class SimulatedBench:
@@ -56,11 +53,11 @@ class SimulatedBench:
             raise ConfigurationError(f"{truth.GROUP}.needle_curvature", truth.needle_curvature, "0: a straight needle")
         self._random = np.random.default_rng([seed, 3])
         self._rig = Rig(bare_rig(truth, self._random), scene)
-        self._count, self._period = len(truth.coil_angles), 1.0 / setup.coils.rate
-        self._interval, self._radius, self._keep_out = 1.0 / truth.frame_rate, scene.dish.radius, setup.coils.keep_out
+        self._count, self._coils = len(truth.coil_angles), setup.coils
+        self._interval, self._radius = 1.0 / truth.frame_rate, scene.dish.radius
         self.now = self._next_frame = START
         self._poses: list[tuple[float, Vector]] = []  # stamp and pose of frames
-        self._arrived, self._reason = 0, "no frames"
+        self._reason = "no frames"
         self._rig.apply(np.full(self._count, 1e-12), 0.0)  # it holds the needle until a current comes
         self._tracker = None
         if drawn:
@@ -73,7 +70,7 @@ class SimulatedBench:
     def pulse(self, currents: Vector, seconds: float) -> Pulse:
         """Give currents for a time, then zeros; see `Bench`."""
         self._await_pose(self.now - BEFORE)
-        on, guard = self.now, MotionGuard(guard_reach(self._radius, self.needle_length, self._keep_out))
+        on, guard = self.now, MotionGuard(guard_reach(self._radius, self.needle_length, self._coils.keep_out))
         guard.update(self._poses[-1][0], middle_of(self._poses[-1][1], self.needle_length))
         guard.begin()
         try:
@@ -108,7 +105,7 @@ class SimulatedBench:
                     bridge.command(OPERATOR, velocity, self.now, count, *now)
                 output = bridge.step(self.now, self.now, driver)
                 self._rig.apply(output.allocation.currents, self.now - START)
-                self.now += self._period
+                self.now += 1.0 / self._coils.rate
         finally:
             self._rig.apply(np.zeros(self._count), self.now - START)
         return square.result(latch.fault)
@@ -131,12 +128,12 @@ class SimulatedBench:
                 for stamp, pose in [entry for entry in known if entry[0] > heard]:
                     guard.update(stamp, middle_of(pose, self.needle_length))
                     heard = stamp
-                if not known or self.now - known[-1][0] > POSE_TIMEOUT:
+                if not known or self.now - known[-1][0] > self._coils.pose_timeout:
                     return f"no pose: {self._reason}"
                 if reason := guard.problem():
                     return reason
             self._rig.apply(currents, self.now - START)
-            self.now += self._period
+            self.now += 1.0 / self._coils.rate
         return ""
 
     def _frames(self, count: int) -> Sequence[RigFrame]:

@@ -33,6 +33,7 @@ Vector = NDArray[np.float64]
 
 START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
 LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph
+POSE_NOISE = np.array([1e-5, 1e-5, 5e-3])  # m, m and rad; of a tracked needle, see docs/results.md
 
 RECORDED = (  # what the bag of a run holds, besides frames
     *(interface.SCENE, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL),
@@ -180,10 +181,9 @@ class ClosedLoop:
         stamp = self.now + frame.stamp_delay
         due = stamp + self._latency
         if self._tracker is None:
-            deviation = np.array([1e-5, 1e-5, 5e-3])  # m and rad; of a tracked needle, see docs/results.md
-            tail = frame.tail + deviation[:2] * self._random.standard_normal(2)
-            angle = frame.heading + deviation[2] * self._random.standard_normal()
-            heading, covariance = np.array([math.cos(angle), math.sin(angle)]), np.diag(deviation**2)
+            tail = frame.tail + POSE_NOISE[:2] * self._random.standard_normal(2)
+            angle = frame.heading + POSE_NOISE[2] * self._random.standard_normal()
+            heading, covariance = np.array([math.cos(angle), math.sin(angle)]), np.diag(POSE_NOISE**2)
             return Measurement(due, stamp, tail, heading, covariance, self._observe(frame.thread))
         if frame.image is None:
             return None
