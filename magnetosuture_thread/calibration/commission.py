@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.calibration.pulse_model import DELAY_UNIT, Pulse, PulseModel, RigParameters
+from magnetosuture_thread.calibration.pulse_model import DELAY_UNIT, KINDS, Pulse, PulseModel, RigParameters, kind_of
+from magnetosuture_thread.coils.pulses import MAX_TIME
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.settings.errors import InvalidInputError
 
@@ -26,12 +27,12 @@ REST_TIME = 1.0  # s; for which the needle is watched before anything moves it
 MAX_DRIFT = 1e-4  # m/s; of a needle at rest: a faster one floats in a stream, or is pulled by something
 START_RADIUS = 0.6  # of the dish's, within which the needle's middle must be
 LEAST_CURRENT, MOST_CURRENT = 0.01, 3.0  # A
-LADDER_TIME, LEAST_TIME = 0.4, 0.02  # s; of a pulse, and of one that ended early
+LADDER_TIME = 0.4  # s; of a pulse of a coil by itself
 ANSWER = 2e-4  # m; a motion that tells a direction, fifteen deviations of a tracked end; at the greatest current half
 ALIGNED, ALIGNING = 0.2, 6  # rad; a needle that turns less in a pulse lies along the field; and pulses until it does
 NOTICED = 3e-5, 0.03  # m and rad; less is no sign that a coil acts, and the current is made four times as large
 MAX_SPEED, MAX_TURN_RATE = 6e-3, 5.0  # m/s and rad/s; predicted of a designed pulse, for the tracker follows no faster
-PULSE_TIME = 0.1, 0.5  # s; of a designed pulse
+PULSE_TIME = 0.1, MAX_TIME  # s; of a designed pulse
 PATH = 2e-4, 1.2e-3  # m; of a designed pulse: what tells something, and what stays near
 REACH = 0.5  # of the dish's radius, to which a designed pulse may lead
 CHANCE = 1.3  # by which a doubt of the heading may grow: of a half turn against the field nobody foresees the way
@@ -41,11 +42,7 @@ MEDIAN_ERROR, WORST_ERROR, HEADING_ERROR = 0.05, 0.20, math.radians(3.0)  # of t
 CHECK_ERROR = 0.12  # of the way; beyond it a rig is another one, and a coil at 0.8 is
 SQUARE_ERROR = 1e-3  # m; of the verdict too
 LEAST_WAY = 3e-4  # m; a shorter displacement counts as this one, for it is measured to some micrometres
-FRAME_TIME = 0.02  # s; between predicted poses of a design
-# 95 % intervals that are narrow enough, of each kind of parameter, as a share but for angle [rad], delay [0.01 s] and
-# residual field [0.1 mT].
-WIDE = {"angle": 0.01, "field": 0.02, "distance": 0.06, "radius": 0.3, "drag along": 0.04, "drag across": 0.06}
-WIDE |= {"turning drag": 0.06, "length": 0.03, "delay": 0.4, "residual x": 0.1, "residual y": 0.1}
+FRAME_TIME = 0.02  # s; between predicted poses of a design; no pulse is shorter, however early it ends
 
 
 class Bench(Protocol):
@@ -273,7 +270,7 @@ class Commissioning:
         while True:
             pulse = self._pulse(currents, LADDER_TIME)
             way, turn = self._motion(pulse)
-            turn_rate = max(turn_rate, abs(turn) / (max(LEAST_TIME, pulse.off - pulse.on) * currents[coil]))
+            turn_rate = max(turn_rate, abs(turn) / (max(FRAME_TIME, pulse.off - pulse.on) * currents[coil]))
             at_most = currents[coil] >= most
             if way > (0.5 if at_most else 1.0) * ANSWER:
                 break
@@ -291,7 +288,7 @@ class Commissioning:
         moved = middles[-3:].mean(axis=0) - middles[~on][-1]
         heading = float(pulse.poses[on, 2].max() + pulse.poses[on, 2].min()) / 2.0
         towards = float(moved @ [math.cos(heading), math.sin(heading)]) > 0.0
-        speed = way / (max(LEAST_TIME, pulse.off - pulse.on) * currents[coil])
+        speed = way / (max(FRAME_TIME, pulse.off - pulse.on) * currents[coil])
         answer = CoilAnswer(float(currents[coil]), math.atan2(moved[1], moved[0]), towards, speed, turn_rate)
         self._log(
             f"coil {coil}: {answer.current:.2f} A, {math.degrees(answer.direction):.0f} degrees, "
@@ -369,7 +366,7 @@ class Commissioning:
     def _wide(self, model: PulseModel) -> list[str]:
         """Return the parameters that are not known well enough."""
         wide = 1.96 * model.deviations
-        return [n for n, w in zip(model.names, wide.tolist(), strict=True) if w > WIDE[n.rstrip(" 0123456789")]]
+        return [name for name, w in zip(model.names, wide.tolist(), strict=True) if w > KINDS[kind_of(name)][1]]
 
     def _intervals(self, model: PulseModel) -> tuple[float, float, float, float]:
         """Return the widest intervals of coil directions, strengths, drags and the delay; see `Commissioned`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,6 +24,7 @@ from magnetosuture_thread.calibration.stop_checks import StopBench, check_stops
 from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.field import CoilProperties
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.evaluation.metrics import plain_values
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings import interface
@@ -103,7 +104,7 @@ def checked_stops(
         currents: see `check_stops`.
         speed: the same.
     """
-    checks = {check.name: check.problem for check in check_stops(bench, currents, speed, log)}
+    checks = check_stops(bench, currents, speed, log)
     with whole_file(path) as partial:
         partial.write_text(json.dumps(checks, indent=2) + "\n", encoding="utf-8")
     return [f"{name}: {problem}" for name, problem in checks.items() if problem]
@@ -172,25 +173,25 @@ class Value:
         unit: SI.
         value: that was found.
         interval: half of its 95 % interval; nan where it has none.
-        believed: by the setup; nan where it says nothing.
         kind: measured, gauge (held, as only its product with others shows) or assumed.
+        before: as believed by the setup; nan where it says nothing.
     """
 
     name: str
     unit: str
     value: float
     interval: float
-    believed: float
     kind: str
+    before: float
 
     @property
     def changed(self) -> bool:
         """Whether it is more than a tenth, or 0.1 rad, off what was believed."""
-        if math.isnan(self.believed) or self.kind == GAUGE:
+        if math.isnan(self.before) or self.kind == GAUGE:
             return False
         if self.unit == "rad":
-            return abs(math.remainder(self.value - self.believed, math.tau)) > CHANGED
-        return abs(self.value - self.believed) > CHANGED * abs(self.believed)
+            return abs(math.remainder(self.value - self.before, math.tau)) > CHANGED
+        return abs(self.value - self.before) > CHANGED * abs(self.before)
 
 
 def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]:
@@ -204,9 +205,9 @@ def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]
     values = []
     for k, coil in enumerate(coils):
         angle, strength = math.remainder(float(rig.angles[k]), math.tau), float(rig.fields[k])
-        values.append(Value(f"{coil.name} angle", "rad", angle, wide[f"angle {k}"], coil.angle, MEASURED))
+        values.append(Value(f"{coil.name} angle", "rad", angle, wide[f"angle {k}"], MEASURED, coil.angle))
         field = wide[f"field {k}"] * abs(strength)
-        values.append(Value(f"{coil.name} field_per_current", "T/A", strength, field, coil.field_per_current, MEASURED))
+        values.append(Value(f"{coil.name} field_per_current", "T/A", strength, field, MEASURED, coil.field_per_current))
     own_drag, thread = needle.slack_drag, believed.thread_drag * liquid_factor(rig, believed)
     shares = (
         ("needle_length", "m", rig.length, wide["length"], believed.needle_length),
@@ -218,16 +219,16 @@ def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]
     )
     for name, unit, value, share, before in shares:
         kind = ASSUMED if share > 0.25 else MEASURED
-        values.append(Value(name, unit, value, share * value, before, kind))
+        values.append(Value(name, unit, value, share * value, kind, before))
     nothing, delay = math.nan, DELAY_UNIT * wide["delay"]
-    values.append(Value("motion_delay", "s", rig.delay, delay, believed.motion_delay, MEASURED))
+    values.append(Value("motion_delay", "s", rig.delay, delay, MEASURED, believed.motion_delay))
     for axis, residual in zip("xy", rig.residual.tolist(), strict=True):
         interval = RESIDUAL_UNIT * wide[f"residual {axis}"]
-        values.append(Value(f"residual field {axis}", "T", residual, interval, nothing, MEASURED))
+        values.append(Value(f"residual field {axis}", "T", residual, interval, MEASURED, nothing))
     mean = math.exp(np.log(np.abs(rig.fields)).mean())
-    values.append(Value("mean field_per_current", "T/A", mean, nothing, mean, GAUGE))
-    values.append(Value("needle_moment", "A m^2", rig.moment, nothing, needle.moment, GAUGE))
-    values.append(Value("thread_drag", "N s/m", thread, nothing, believed.thread_drag, ASSUMED))
+    values.append(Value("mean field_per_current", "T/A", mean, nothing, GAUGE, mean))
+    values.append(Value("needle_moment", "A m^2", rig.moment, nothing, GAUGE, needle.moment))
+    values.append(Value("thread_drag", "N s/m", thread, nothing, ASSUMED, believed.thread_drag))
     return values
 
 
@@ -344,9 +345,7 @@ def summary_of(result: Commissioned, setup: Setup, how: Mapping[str, Any]) -> di
     """
     summary: dict[str, Any] = {"setup": setup.name, "verdict": "refused" if result.failures else "pass"}
     summary |= {"failures": list(result.failures), "findings": list(result.findings), **how}
-    summary["ladder"] = [
-        {name: None if value != value else value for name, value in asdict(answer).items()} for answer in result.answers
-    ]
+    summary["ladder"] = [plain_values(answer) for answer in result.answers]
     largest = max(float(np.abs(pulse.currents).max()) for pulse in result.pulses)
     summary |= {"pulses": len(result.pulses), "largest_current": largest}
     if len(result.errors):
@@ -357,17 +356,6 @@ def summary_of(result: Commissioned, setup: Setup, how: Mapping[str, Any]) -> di
         summary["verification"]["square"] = result.square
     if result.model is not None:
         values = values_of(result, setup.coils)
-        summary["values"] = [
-            {
-                "name": value.name,
-                "unit": value.unit,
-                "value": value.value,
-                "interval": None if math.isnan(value.interval) else value.interval,
-                "kind": value.kind,
-                "before": None if math.isnan(value.believed) else value.believed,
-                "changed": value.changed,
-            }
-            for value in values
-        ]
+        summary["values"] = [{**plain_values(value), "changed": value.changed} for value in values]
         summary["not_known_well_enough"] = list(result.open)
     return summary

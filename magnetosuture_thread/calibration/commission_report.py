@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -67,17 +68,18 @@ def draw_report(result: Commissioned, setup: Setup, summary: Mapping[str, Any], 
     figure.text(0.06, 0.945, f"{how}; at most {summary['largest_current']:.2f} A", fontsize=9, **text)
     figure.add_artist(Rectangle((0.06, 0.898), 0.88, 0.026, color=GOOD if passed else BAD))
     figure.text(0.07, 0.911, verdict, fontsize=12, weight="bold", color="white", va="center")
-    lines = [*(f"Refused: {words}" for words in result.failures), *(sentence(words) for words in result.findings)]
-    lines = lines or ["Nothing differs from the setup but the values below."]
+    lines = [f"refused: {words}" for words in result.failures] + [*result.findings]
+    lines = lines or ["nothing differs from the setup but the values below."]
+    wrapped = [textwrap.fill(line[:1].upper() + line[1:], 54, subsequent_indent="    ") for line in lines[:12]]
     figure.text(0.47, 0.878, "What was found", fontsize=11, weight="bold", **text)
-    figure.text(0.47, 0.859, "\n".join(map(_wrapped, lines[:12])), fontsize=9.5, linespacing=1.5, **text)
-    _draw_coils(_place(figure, 0.05, 0.625, 0.40, 0.265), result, setup)
+    figure.text(0.47, 0.859, "\n".join(wrapped), fontsize=9.5, linespacing=1.5, **text)
+    _draw_coils(figure.add_axes((0.05, 0.625, 0.40, 0.265)), result, setup)
     if result.model is None:
         _draw_ladder(figure, result, 0.60)
         return _saved(figure, kind)
-    _draw_verification(_place(figure, 0.56, 0.645, 0.38, 0.085), result)
+    _draw_verification(figure.add_axes((0.56, 0.645, 0.38, 0.085)), result)
     _draw_table(figure, values_of(result, setup.coils), 0.60)
-    _draw_history(_place(figure, 0.10, 0.055, 0.84, 0.10), result)
+    _draw_history(figure.add_axes((0.10, 0.055, 0.84, 0.10)), result)
     notes = (
         "Gauge: a motion shows only field x moment / drag, so the mean field and the moment are held; one reading\n"
         "of a probe fixes teslas. Assumed: a bare needle does not show it; the thread's drag follows the needle's.\n"
@@ -87,29 +89,11 @@ def draw_report(result: Commissioned, setup: Setup, summary: Mapping[str, Any], 
     return _saved(figure, kind)
 
 
-def sentence(words: str) -> str:
-    """Return words that begin with a capital letter."""
-    return words[:1].upper() + words[1:]
-
-
-def _wrapped(line: str, width: int = 54) -> str:
-    words, rows = line.split(), [""]
-    for word in words:
-        if len(rows[-1]) + len(word) > width:
-            rows.append("   ")
-        rows[-1] += (" " if rows[-1].strip() else "") + word
-    return "\n".join(rows)
-
-
 def _saved(figure: Figure, kind: str) -> bytes:
     stream = io.BytesIO()
     metadata: dict[str, Any] = {"CreationDate": None} if kind == "pdf" else {"Software": None}
     figure.savefig(stream, format=kind, metadata=metadata)
     return stream.getvalue()
-
-
-def _place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
-    return figure.add_axes((left, bottom, width, height))
 
 
 def _draw_coils(axes: Axes, result: Commissioned, setup: Setup) -> None:
@@ -201,7 +185,7 @@ def _draw_table(figure: Figure, values: Sequence[Value], top: float) -> None:
         factor, unit = SHOWN[value.unit]
         cells = [value.name, f"{factor * value.value:.4g} {unit}"]
         cells.append("" if math.isnan(value.interval) else f"{factor * value.interval:.2g}")
-        cells.append("" if math.isnan(value.believed) or value.kind == GAUGE else f"{factor * value.believed:.4g}")
+        cells.append("" if math.isnan(value.before) or value.kind == GAUGE else f"{factor * value.before:.4g}")
         rows.append((value.changed, [*cells, _change(value), value.kind]))
     _draw_rows(figure, columns, rows, top)
 
@@ -237,11 +221,11 @@ def _draw_rows(
 
 
 def _change(value: Value) -> str:
-    if math.isnan(value.believed) or value.kind == GAUGE:
+    if math.isnan(value.before) or value.kind == GAUGE:
         return ""
     if value.unit == "rad":
-        return f"{math.degrees(math.remainder(value.value - value.believed, math.tau)):+.1f}°"
-    return "" if not value.believed else f"{100.0 * (value.value / value.believed - 1.0):+.0f} %"
+        return f"{math.degrees(math.remainder(value.value - value.before, math.tau)):+.1f}°"
+    return "" if not value.before else f"{100.0 * (value.value / value.before - 1.0):+.0f} %"
 
 
 def write_results(

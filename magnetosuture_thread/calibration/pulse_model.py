@@ -27,20 +27,21 @@ START_STEP = np.array([1e-6, 1e-6, 1e-4])  # m, m and rad; of where a needle sta
 RESIDUAL_UNIT, DELAY_UNIT = 1e-4, 0.01  # T and s
 OUTLIER = 3.0  # standard deviations, beyond which a residual counts less (Huber)
 ROUNDS = 4  # of the fit, each with the starts of the one before
-SHARED = (
-    "distance",
-    "radius",
-    "drag along",
-    "drag across",
-    "turning drag",
-    "length",
-    "delay",
-    "residual x",
-    "residual y",
-)
-# Standard deviations of what a ruler and a label say before: of logarithms, but of the last three.
-PRIOR = (0.15, 0.25, 3.0, 3.0, 3.0, 0.01, 5.0, 3.0, 3.0)
-ANGLE_PRIOR, GAIN_PRIOR = 3.0, 1.5
+# Kinds of parameters, the first two of each coil: standard deviation of what a ruler and a label say before, and the
+# 95 % interval that is narrow enough; of the logarithm, but of angles [rad], delay and residual field in their units.
+KINDS = {
+    "angle": (3.0, 0.01),
+    "field": (1.5, 0.02),
+    "distance": (0.15, 0.06),
+    "radius": (0.25, 0.3),
+    "drag along": (3.0, 0.04),
+    "drag across": (3.0, 0.06),
+    "turning drag": (3.0, 0.06),
+    "length": (0.01, 0.03),
+    "delay": (5.0, 0.4),
+    "residual x": (3.0, 0.1),
+    "residual y": (3.0, 0.1),
+}
 END_BIAS = 1.2e-5  # m; error of a needle's end that is the same in all frames, 0.15 px of 0.08 mm
 SHAPE_BIAS = 0.004  # of a drag: of coils that are one loop here, and of the camera's scale
 
@@ -186,6 +187,11 @@ class RigParameters:
         return np.array([self.moment, self.length, *self.drag])
 
 
+def kind_of(name: str) -> str:
+    """Return the kind of a parameter: its name without the number of a coil."""
+    return name.rstrip(" 0123456789")
+
+
 def difference(poses: Vector, others: Vector) -> Vector:
     """Return by how much poses differ from others, the heading by less than half a turn, shape (k, 3)."""
     apart = poses - others
@@ -219,11 +225,12 @@ class PulseModel:
     def __init__(self, guess: RigParameters, deviations: Vector) -> None:
         self._guess, self._sigma, count = guess, deviations, len(guess.angles)
         self._signs, self._field = np.sign(guess.fields), math.exp(np.log(np.abs(guess.fields)).mean())
-        self.names = [f"angle {k}" for k in range(count)] + [f"field {k}" for k in range(count)] + list(SHARED)
+        of_each, shared = [*KINDS][:2], [*KINDS][2:]
+        self.names = [f"{kind} {k}" for kind in of_each for k in range(count)] + shared
         logs = np.log([guess.distance, guess.radius, *guess.drag, guess.length])
         others = guess.delay / DELAY_UNIT, *(guess.residual / RESIDUAL_UNIT)
         self._p = np.array([*guess.angles, *np.log(np.abs(guess.fields) / self._field), *logs, *others])
-        self._prior, self._weak = self._p.copy(), np.array([ANGLE_PRIOR] * count + [GAIN_PRIOR] * count + [*PRIOR])
+        self._prior, self._weak = self._p.copy(), np.array([KINDS[kind_of(name)][0] for name in self.names])
         self.information, self.chi_square = np.diag(self._weak**-2.0), 1.0
         self._covariance = np.diag(self._weak**2)
         self._starts: list[Vector] = []

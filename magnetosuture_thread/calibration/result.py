@@ -14,7 +14,7 @@ from magnetosuture_thread.bags.storage import MAX_SILENCE
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, mean_across, mean_error
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
+from magnetosuture_thread.evaluation.metrics import SensorSilence, plain_values
 from magnetosuture_thread.geometry.polyline import Points
 
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
@@ -205,16 +205,12 @@ class CalibrationResult:
             "material": self.settings.material,
             "formulation": self.settings.formulation,
             "against": self.against,
-            "parameters": [_plain(estimate) for estimate in self.estimates],
+            "parameters": [plain_values(estimate) for estimate in self.estimates],
             "attachment": asdict(self.attachment) if self.attachment is not None else None,
-            "bags": [_plain(score) for score in self.scores],
+            "bags": [plain_values(score) for score in self.scores],
             "warnings": self.warnings,
             "replays": self.replays,
         }
-
-
-def _plain(values: Any) -> dict[str, Any]:
-    return {key: finite_or_none(value) for key, value in asdict(values).items()}
 
 
 def to_yaml(calibration: CalibrationResult) -> str:

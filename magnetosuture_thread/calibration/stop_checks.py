@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -12,28 +11,15 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.commission import middle_of
 from magnetosuture_thread.calibration.pulse_model import Pulse
-from magnetosuture_thread.coils.pulses import STOOD_STILL
+from magnetosuture_thread.coils.pulses import MAX_TIME, STOOD_STILL
 
 Vector = NDArray[np.float64]
 
-PULSE_TIME, BEGIN = 0.5, 0.05  # s; of a pulse that is ended, and after which it is
+BEGIN = 0.05  # s; after which a pulse is ended
 TO_REST, RESTING = 0.3, 0.7  # s in which a needle comes to rest and frames show it: delays; and in which it rests
 STILL_SHARE, STILL_WAY = 0.2, 5e-5  # of the speed under the current, and m that errors of poses seem to be a way
 FEWEST_POSES = 5  # that show whether a needle rests
 TRIES = 3  # a busy computer may disturb a pulse too late, or stand still itself
-
-
-@dataclass(frozen=True)
-class StopCheck:
-    """What came of a check.
-
-    Attributes:
-        name: of what ended the currents.
-        problem: why it failed; empty if it passed.
-    """
-
-    name: str
-    problem: str
 
 
 class StopBench(Protocol):
@@ -80,8 +66,8 @@ class StopBench(Protocol):
         """
 
 
-def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[[str], None]) -> list[StopCheck]:
-    """Let an emergency stop, lost poses and a bridge that stands still end currents; return what came of each.
+def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[[str], None]) -> dict[str, str]:
+    """Let an emergency stop, lost poses and a bridge that stands still end currents.
 
     By the bridge the currents have to end in time and for that reason; by the camera the needle has to rest after that.
 
@@ -90,8 +76,11 @@ def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[
         currents: the least that move the needle, shape (m,) [A].
         speed: with which they do [m/s].
         log: called with a line for a person.
+
+    Returns:
+        Why each failed, by the name of what ended the currents; empty if it passed.
     """
-    checks = []
+    problems = {}
     for name, disturb, ended, causes in (
         ("emergency stop", bench.stopped, "emergency stop", ("emergency stop",)),
         ("no poses", bench.blind, "no needle pose", ()),
@@ -103,7 +92,7 @@ def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[
                 log(f"{name}: not checked from here: end the bridge by kill -9 while a current flows")
                 break
             hold = RESTING + (0.0 if ended else bench.driver_timeout + TO_REST)
-            pulse, begun, over = bench.disturbed_pulse(currents, PULSE_TIME, BEGIN, disturbance, hold)
+            pulse, begun, over = bench.disturbed_pulse(currents, MAX_TIME, BEGIN, disturbance, hold)
             bench.recover(causes)
             problem = "" if ended in pulse.ended else f"currents ended by {pulse.ended or 'their time'}"
             tries = tries - 1 if problem else 0
@@ -114,8 +103,8 @@ def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[
             problem = problem or _moving(middle_of(pulse.poses, bench.needle_length)[resting], speed)
         else:
             log(f"{name}: {problem or 'ends the currents'}")
-            checks.append(StopCheck(name, problem))
-    return checks
+            problems[name] = problem
+    return problems
 
 
 def _moving(middles: Vector, speed: float) -> str:

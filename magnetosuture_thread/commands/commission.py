@@ -101,7 +101,7 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
     summary = write_results(folder, result, setup, how, datetime.date.today().isoformat())
     if result.model is not None:
         rows = [
-            (value.name, *_cells(value.value, value.interval, value.believed), value.unit, value.kind)
+            (value.name, *_cells(value.value, value.interval, value.before), value.unit, value.kind)
             for value in values_of(result, setup.coils)
         ]
         columns = ("value", "found", "95 % ±", "setup", "unit", "known by")

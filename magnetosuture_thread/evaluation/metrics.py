@@ -47,6 +47,11 @@ def finite_or_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def plain_values(figures: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass as they go into JSON, see `finite_or_none`."""
+    return {key: finite_or_none(value) for key, value in asdict(figures).items()}
+
+
 def error_figures(errors: Array) -> dict[str, float] | None:
     """Return count, mean, median, p99 and maximum of errors in %; None if there are none."""
     finite = errors[np.isfinite(errors)]

@@ -34,6 +34,7 @@ from magnetosuture_thread.evaluation.metrics import (
     SensorSilence,
     compare_errors,
     finite_or_none,
+    plain_values,
 )
 from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.needle_arc import needle_axis
@@ -186,7 +187,7 @@ class LoopSummary(RunSummary):
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none; units as above."""
-        return {key: finite_or_none(value) for key, value in asdict(self).items()}
+        return plain_values(self)
 
 
 class LoopCollector:
