@@ -19,7 +19,6 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields
 from itertools import islice
@@ -46,7 +45,7 @@ from magnetosuture_thread.geometry.scene import (
 )
 from magnetosuture_thread.geometry.shapes import Disc, Polygon, Ring, Vertex, triangulate
 from magnetosuture_thread.settings import shared_parameters as shared
-from magnetosuture_thread.settings.configuration import read_yaml, suggest_names
+from magnetosuture_thread.settings.configuration import bounded, errors_of_file, read_yaml, suggest_names
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, find_file, output_problem, read_regular
 
@@ -55,15 +54,6 @@ COMMON = ("kind", "corner_radius", "friction")  # fields of all shapes
 DISH_FIELDS = tuple(field.name for field in fields(Dish))
 PROPERTIES = ("name", *COMMON, "radius", "definition", *DISH_FIELDS)
 ARC_TOLERANCE = 2e-6  # m; greatest distance of an arc from its chords
-
-
-@contextmanager
-def located(source: str, prefix: str = "") -> Iterator[None]:
-    """Name the file, and the shape if there is one, in errors that come from within."""
-    try:
-        yield
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{prefix}{error.name}", error.value, error.expectation, source) from None
 
 
 def is_list(value: Any) -> bool:
@@ -86,9 +76,7 @@ def _read_field(name: str, field: str, value: Any) -> Any:
     low, high, unit = 0.0 if field == "inset" else 1e-6, MAX_COORDINATE, "m"
     if field.endswith("angle"):
         low, high, unit = -2.0 * math.pi, (2.0 if field == "angle" else 4.0) * math.pi, "rad"
-    if not is_number(value) or not low <= value <= high:
-        raise ConfigurationError(name, value, f"a number from {low:g} to {high:g} {unit}")
-    return float(value)
+    return bounded(unit, low, high).checked(name, value)
 
 
 def _point(name: str, value: Any) -> Vertex:
@@ -256,12 +244,12 @@ def shape_from_mapping(name: str, description: Any, source: str = "") -> SceneSh
     if unknown or len(types) != 1:
         value = unknown[0] if unknown else types or "no shape"
         raise ConfigurationError(name, value, f"{', '.join(COMMON)} and one of {', '.join(SHAPES)}", source)
-    with located(source, f"{name}."):
+    with errors_of_file(source, f"{name}."):
         geometry = _geometry(types[0], description[types[0]], description.get("corner_radius", 0.0))
     # A copy in the types that YAML and JSON can write, whatever numbers and lists it has.
     definition = {key: value for key, value in description.items() if key not in ("kind", "friction")}
     kind, friction = description.get("kind", "tissue"), description.get("friction", 0.0)
-    with located(source):
+    with errors_of_file(source):
         return SceneShape(name, kind, geometry, json.loads(json.dumps(definition)), friction)
 
 
@@ -297,7 +285,7 @@ def dish_from_mapping(values: Any, source: str = "") -> Dish:
     for field, value in values.items():
         if field not in DISH_FIELDS:
             raise ConfigurationError(f"dish.{field}", value, suggest_names(str(field), list(DISH_FIELDS)), source)
-    with located(source):
+    with errors_of_file(source):
         return Dish(**values)
 
 
@@ -323,7 +311,7 @@ def scene_from_mapping(content: Any, source: str = "") -> Scene:
     if len(shapes) > MAX_SHAPES:
         raise ConfigurationError("shapes", f"{len(shapes)} shapes", f"at most {MAX_SHAPES}", source)
     named = tuple(shape_from_mapping(name, description, source) for name, description in shapes.items())
-    with located(source):
+    with errors_of_file(source):
         return Scene(dish, named)
 
 
@@ -409,7 +397,7 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
     if len(dishes) != 1:
         count = f"{len(dishes)} dishes" if dishes else "no dish"
         raise ConfigurationError("dish", count, "one: the member dish, or a feature of kind dish", source)
-    with located(source):
+    with errors_of_file(source):
         return Scene(dishes[0], tuple(shapes))
 
 
@@ -544,43 +532,3 @@ class SceneServerSettings(shared.LifecycleSettings, shared.SceneName):
     """The scene that is published first."""
 
     GROUP: ClassVar[str] = "scene_server"
-
-
-class SceneEditor:
-    """Holds the active scene and edits it; an invalid edit leaves it unchanged.
-
-    Args:
-        scene: the initial scene; None until one is loaded.
-
-    Attributes:
-        scene: the active scene.
-
-    Each edit raises `ConfigurationError` where it is invalid, whatever the text.
-    """
-
-    def __init__(self, scene: Scene | None = None) -> None:
-        self.scene = scene
-
-    def load(self, file: str) -> None:
-        """Load the scene of a file, given as a path or as the name of one that ships with the package."""
-        if len(file) > 4096:
-            raise ConfigurationError("file", f"{len(file)} characters", "at most 4096")
-        self.scene = read_scene(file)
-
-    def add(self, shape: SceneShape) -> None:
-        """Append a shape."""
-        self.scene = self._require_scene().add(shape)
-
-    def replace(self, shape: SceneShape) -> None:
-        """Replace the shape of the same name."""
-        self.scene = self._require_scene().replace(shape)
-
-    def remove(self, name: str) -> None:
-        """Remove a shape."""
-        self.scene = self._require_scene().remove(name)
-
-    def _require_scene(self) -> Scene:
-        if self.scene is None:
-            expectation = "a scene that is loaded first, of which the dish is known"
-            raise ConfigurationError("scene", "a change of a shape", expectation)
-        return self.scene

@@ -279,12 +279,13 @@ def _checker(hint: Any) -> Callable[[str, Any], Any] | None:
 
 
 @contextmanager
-def errors_of_file(source: str) -> Iterator[None]:
-    """Name a file in every `ConfigurationError` that names none yet."""
+def errors_of_file(source: str, prefix: str = "") -> Iterator[None]:
+    """Name a file in every `ConfigurationError` that names none yet, and put a prefix before what it is about."""
     try:
         yield
     except ConfigurationError as error:
-        raise ConfigurationError(error.name, error.value, error.expectation, error.source or source) from None
+        name, source = f"{prefix}{error.name}", error.source or source
+        raise ConfigurationError(name, error.value, error.expectation, source) from None
 
 
 def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C:
