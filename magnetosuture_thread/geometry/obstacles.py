@@ -690,6 +690,11 @@ def _from_polygon(
 def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, data: WorkspaceData) -> float:
     """Return the least signed distance of a node and the half segments beside it from one shape or the wall [m].
 
+        min sd(x_i + s (x_j - x_i) / 2)  over  0 <= s <= 1,  j = i - 1, i + 1
+
+    Exact for discs, balls, the wall and outside of polygons, within 0.1 um below inside of them: so the least over all
+    nodes is that of the whole polyline, but for shapes that no node is near.
+
     Args:
         points: nodes, shape (n + 1, d) [m].
         i: the node.
@@ -716,23 +721,3 @@ def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, 
             found = _from_polygon(ax, ay, bx, by, signed, data.order[obstacle] - discs, data)
         least = min(least, found)
     return least
-
-
-@compiled
-def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contacts) -> NDArray[np.float64]:
-    """Return the least signed distance of a node and the half segments beside it, for each contact, shape (k,) [m].
-
-        min sd(x_i + s (x_j - x_i) / 2)  over  0 <= s <= 1,  j = i - 1, i + 1
-
-    Exact for discs, balls, the wall and outside of polygons, within 0.1 um below inside of them: so the least over all
-    nodes is that of the whole polyline, but for shapes that no node is near.
-
-    Args:
-        points: nodes, shape (n + 1, d) [m].
-        data: `Workspace.data`.
-        contacts: of these nodes with it.
-    """
-    distance: NDArray[np.float64] = contacts.distance.copy()
-    for row in range(len(distance)):
-        distance[row] = half_segment_distance(points, contacts.node[row], contacts.obstacle[row], distance[row], data)
-    return distance

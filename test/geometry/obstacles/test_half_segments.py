@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace, half_segment_distances
+from magnetosuture_thread.geometry.obstacles import Contacts, Disc, Obstacle, Polygon, Workspace, half_segment_distance
 
 REACH = 5e-3
 WALL_RADIUS = 0.012
@@ -26,6 +26,12 @@ def polyline(random: np.random.Generator, dimension: int) -> np.ndarray:
     return np.vstack([np.zeros(dimension), np.cumsum(ways, axis=0)]) + random.uniform(-6e-3, 6e-3, dimension)
 
 
+def distances_of(nodes: np.ndarray, workspace: Workspace, contacts: Contacts) -> np.ndarray:
+    """Return the distance of a node and the half segments beside it, for each contact."""
+    pairs = zip(contacts.node, contacts.obstacle, contacts.distance, strict=True)
+    return np.array([half_segment_distance(nodes, *pair, workspace.data) for pair in pairs])
+
+
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_no_point_of_a_chord_is_closer_than_its_distance_and_one_is_as_close(seed: int, dimension: int):
@@ -38,7 +44,7 @@ def test_no_point_of_a_chord_is_closer_than_its_distance_and_one_is_as_close(see
     for _ in range(3):
         nodes = polyline(random, dimension)
         contacts = near.near(nodes)
-        found = half_segment_distances(nodes, near.data, contacts)
+        found = distances_of(nodes, near, contacts)
         for i in range(len(nodes)):
             beside = [j for j in (i - 1, i + 1) if 0 <= j < len(nodes)]
             sampled = far.near(np.vstack([nodes[i] + SAMPLES * (nodes[j] - nodes[i]) for j in beside]))
@@ -57,9 +63,9 @@ def test_beside_an_edge_and_through_a_thin_shape_nothing_is_missed():
     workspace = Workspace([thin, Disc((0.0, 8e-3), 1e-3)], REACH)
     through = np.array([[-5e-4, 0.0], [5e-4, 0.0]])
     contacts = workspace.near(through)
-    found = half_segment_distances(through, workspace.data, contacts)[contacts.obstacle == 0]
+    found = distances_of(through, workspace, contacts)[contacts.obstacle == 0]
     np.testing.assert_allclose(found, -1e-4, atol=2e-7)
     beside = np.array([[3e-4, -1e-3], [3e-4, 1e-3], [3e-4, 3e-3]])
     contacts = workspace.near(beside)
-    found = half_segment_distances(beside, workspace.data, contacts)[contacts.obstacle == 0]
+    found = distances_of(beside, workspace, contacts)[contacts.obstacle == 0]
     np.testing.assert_allclose(found, 2e-4, atol=1e-12)
