@@ -11,9 +11,9 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, cast
 
 from magnetosuture_thread.calibration.parameters import choose_parameters
-from magnetosuture_thread.calibration.recorded_run import BestSettings, RecordedRun, read_run, replay_pool
+from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
 from magnetosuture_thread.calibration.result import CalibrationResult, to_yaml
-from magnetosuture_thread.calibration.search import calibrate, unfinished_result
+from magnetosuture_thread.calibration.search import calibrate
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.evaluation.recorded import BagInput, BagSelection, open_bag, setup_of_notes
 from magnetosuture_thread.evaluation.replay import picture_or_log
@@ -95,16 +95,9 @@ def calibrate_bags(
                     raise InvalidInputError(str(path), f"a thread with {name} {words}", expectation)
             runs.append(_read_run(path, bag, settings, against, partial(advance, index)))
         advance(index, 1.0)
-    best = BestSettings()
-    try:
-        with replay_pool(runs, min(workers, os.cpu_count() or 1), scheduler) as run:
-            stages: dict[str, Any] = {"progress": lambda share: progress(READING + (1.0 - READING) * share), "log": log}
-            result, fits = calibrate(runs, settings, parameters, run_tasks=run, best=best, **stages)
-    except KeyboardInterrupt:
-        if best.settings is None:
-            raise
-        log("interrupted; writing the best so far")
-        result, fits = unfinished_result(runs, settings, best)
+    workers = min(workers, os.cpu_count() or 1)
+    stages: dict[str, Any] = {"progress": lambda share: progress(READING + (1.0 - READING) * share), "log": log}
+    result, fits = calibrate(runs, settings, parameters, workers=workers, scheduler=scheduler, **stages)
     with whole_file(output) as partial_file:
         partial_file.write_text(to_yaml(result), encoding="utf-8")
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,7 +188,6 @@ def _moved(run: RecordedRun) -> float:
 
 
 Task = tuple[int, ThreadModelSettings]
-RunTasks = Callable[[Sequence[Task]], list[Points]]
 Array = NDArray[np.float64]
 
 
@@ -223,30 +219,8 @@ def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> P
     return kept
 
 
-@contextmanager
-def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") -> Iterator[RunTasks]:
-    """Give a function that runs tasks, here or in processes of their own; see `TaskRunner`.
-
-    Args:
-        runs: that tasks name by their index.
-        workers: number of processes; with one, no other process is started.
-        scheduler: address of a Dask scheduler, whose workers replay in place of those; empty for none.
-
-    Raises:
-        GraphError: a process died.
-    """
-    with TaskRunner(partial(_run_task, tuple(runs)), workers, scheduler) as runner:
-
-        def run(tasks: Sequence[Task]) -> list[Points]:
-            results: dict[int, Any] = dict(runner.run(tasks))
-            if any(isinstance(result, WorkerDiedError) for result in results.values()):
-                raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
-            return [results[index] for index in range(len(tasks))]
-
-        yield run
-
-
-def _run_task(runs: Sequence[RecordedRun], task: Task, log: Log, progress: Progress) -> Points:
+def replay_task(runs: Sequence[RecordedRun], task: Task, log: Log, progress: Progress) -> Points:
+    """Return the predicted nodes of one task, as the work of a `TaskRunner`."""
     index, settings = task
     return replay_with_parameters(runs[index], settings)
 
@@ -305,49 +279,32 @@ def mean_error(vertices: Points, targets: Points, length: float) -> float:
     return float(frames.mean()) if known.any() else math.nan
 
 
-@dataclass
-class BestSettings:
-    """The best settings that a search has found so far.
-
-    Attributes:
-        settings: of it; None before anything is known.
-        error: mean over the runs of the prediction error [% of length].
-        vertices: predicted with them, of each run.
-        first: predicted with the settings that were tried first.
-        replays: how many runs have been replayed.
-    """
-
-    settings: ThreadModelSettings | None = None
-    error: float = math.inf
-    vertices: list[Points] = field(default_factory=list)
-    first: list[Points] = field(default_factory=list)
-    replays: int = 0
-
-
 class Replays:
-    """Replays recorded runs, remembers the last predictions, and reports the progress of a search.
+    """Replays recorded runs, remembers the last predictions and the best, and reports the progress of a search.
 
     Args:
         runs: the recorded runs.
-        run_tasks: gives the predicted nodes of tasks, in their order; here, one after the other, if None.
-        best: is updated with every whole set of replays.
+        runner: of tasks, whose work is `replay_task`.
         expected: how many replays the search takes, roughly.
         progress: called with the share of these that is done.
         log: called with a line at the end of each stage.
+
+    Attributes:
+        runs: as given.
+        best: settings of the least mean prediction error over the runs so far; None before anything is known.
+        best_vertices: predicted with them, of each run.
+        first_vertices: predicted with the settings that were tried first.
+        count: how many runs have been replayed.
     """
 
     def __init__(
-        self,
-        runs: Sequence[RecordedRun],
-        run_tasks: RunTasks | None,
-        best: BestSettings | None,
-        expected: int,
-        progress: Progress,
-        log: Log,
+        self, runs: Sequence[RecordedRun], runner: TaskRunner, expected: int, progress: Progress, log: Log
     ) -> None:
-        self.runs, self.best = tuple(runs), best or BestSettings()
-        self._run_tasks = run_tasks or self._run_here
-        self._expected, self._progress, self._log = expected, progress, log
+        self.runs, self.count = tuple(runs), 0
+        self.best: ThreadModelSettings | None = None
+        self.best_vertices: list[Points] = []
+        self.first_vertices: list[Points] = []
+        self._runner, self._expected, self._progress, self._log = runner, expected, progress, log
         self._known: dict[Task, Points] = {}
         self._errors: dict[ThreadModelSettings, float] = {}
 
@@ -356,27 +313,29 @@ class Replays:
         chosen = range(len(self.runs)) if which is None else which
         tasks = dict.fromkeys((index, settings) for settings in many for index in chosen)
         missing = [task for task in tasks if task not in self._known]
-        if missing:
-            self._known.update(zip(missing, self._run_tasks(missing), strict=True))
+        for index, vertices in self._runner.run(missing):
+            if isinstance(vertices, WorkerDiedError):
+                raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
+            self._known[missing[index]] = vertices
         result = [[self._known[index, settings] for index in chosen] for settings in many]
         # Of the last 16 settings: a Jacobian asks again for its middle.
         for task in list(self._known)[: -16 * len(self.runs)]:
             del self._known[task]
-        self.best.replays += len(missing)
+        self.count += len(missing)
         if len(chosen) == len(self.runs):
-            for settings, vertices in zip(many, result, strict=True):
-                self._keep_best(settings, vertices)
-        self._progress(min(0.99, self.best.replays / self._expected))
+            for settings, of_runs in zip(many, result, strict=True):
+                self._keep_best(settings, of_runs)
+        self._progress(min(0.99, self.count / self._expected))
         return result
 
     def _keep_best(self, settings: ThreadModelSettings, vertices: list[Points]) -> None:
-        pairs, best = zip(vertices, self.runs, strict=True), self.best
         if settings not in self._errors:
+            pairs = zip(vertices, self.runs, strict=True)
             errors = [mean_error(v, run.targets, settings.thread_length) for v, run in pairs]
             self._errors[settings] = float(np.mean(errors))
-        best.first = best.first or vertices
-        if self._errors[settings] < best.error:
-            best.settings, best.error, best.vertices = settings, self._errors[settings], vertices
+        self.first_vertices = self.first_vertices or vertices
+        if self.best is None or self._errors[settings] < self._errors[self.best]:
+            self.best, self.best_vertices = settings, vertices
 
     def error(self, settings: ThreadModelSettings) -> float:
         """Return the mean over the runs of the prediction error [% of length]."""
@@ -386,8 +345,5 @@ class Replays:
 
     def report(self, result: str) -> None:
         """Log what a stage of the search came to."""
-        error, count = self.best.error, self.best.replays
-        self._log(f"{result}; least distance of the nodes {error:.3g} % of the length after {count} replays")
-
-    def _run_here(self, tasks: Sequence[Task]) -> list[Points]:
-        return [replay_with_parameters(self.runs[index], settings) for index, settings in tasks]
+        error = min(self._errors.values())
+        self._log(f"{result}; least distance of the nodes {error:.3g} % of the length after {self.count} replays")

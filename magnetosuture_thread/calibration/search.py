@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,13 +24,12 @@ from magnetosuture_thread.calibration.parameters import (
     with_stiffness_over_drag,
 )
 from magnetosuture_thread.calibration.recorded_run import (
-    BestSettings,
     RecordedRun,
     Replays,
-    RunTasks,
     across_residuals,
     mean_across,
     offset_residuals,
+    replay_task,
 )
 from magnetosuture_thread.calibration.result import (
     FIXED,
@@ -43,7 +43,7 @@ from magnetosuture_thread.calibration.result import (
 )
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import ThreadSession
-from magnetosuture_thread.evaluation.workers import Log, Progress
+from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import Attachment
@@ -61,8 +61,8 @@ def calibrate(
     settings: ThreadModelSettings,
     names: Sequence[str] = (),
     *,
-    run_tasks: RunTasks | None = None,
-    best: BestSettings | None = None,
+    workers: int = 1,
+    scheduler: str = "",
     progress: Progress = lambda share: None,
     log: Log = lambda line: None,
 ) -> tuple[CalibrationResult, list[BagFit]]:
@@ -75,12 +75,14 @@ def calibrate(
     4. What cannot be identified is put back to what the setup says, and the rest is fitted again.
     5. With several runs, each is predicted by a fit to the others.
 
+    Ctrl-C ends it with the best so far, without intervals, once there is any.
+
     Args:
         runs: recorded runs of one thread.
         settings: what the setup and the material say; where the fit starts.
         names: of settings to fit; all that the formulation has if empty.
-        run_tasks: gives the predictions of tasks; here, one after the other, if None.
-        best: is updated with the best so far at every moment.
+        workers: processes that replay the runs; with one, no other process is started.
+        scheduler: address of a Dask scheduler, whose workers replay in place of those; empty for none.
         progress: called with the share done, 0 to 1.
         log: called with a line at the end of each stage.
 
@@ -89,6 +91,7 @@ def calibrate(
 
     Raises:
         ConfigurationError: a name is unknown, the thread is not in a liquid, or an obstacle cannot be used.
+        GraphError: a process died.
     """
     parameters, both = choose_parameters(settings.formulation, names)
     if settings.medium != "liquid":
@@ -97,7 +100,24 @@ def calibrate(
         ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
     count, derivatives = len(runs), len(parameters) + 1
     expected = count * (60 + 10 * derivatives + 3 * (count - 1) * derivatives)
-    replays = Replays(runs, run_tasks, best, expected, progress, log)
+    with TaskRunner(partial(replay_task, tuple(runs)), workers, scheduler) as runner:
+        replays = Replays(runs, runner, expected, progress, log)
+        try:
+            found = _search(replays, settings, parameters, both)
+        except KeyboardInterrupt:
+            if replays.best is None:
+                raise
+            log("interrupted; writing the best so far")
+            return _unfinished_result(replays, settings)
+    progress(1.0)
+    return found
+
+
+def _search(
+    replays: Replays, settings: ThreadModelSettings, parameters: Sequence[Parameter], both: bool
+) -> tuple[CalibrationResult, list[BagFit]]:
+    """Return what `calibrate` finds; `both` attachments are tried where it is one of the parameters."""
+    runs, count = replays.runs, len(replays.runs)
     replays.error(settings)
     candidates = initial_guesses(replays, settings, parameters, both)
     solutions = [_robust_fit(Objective(replays, candidate, parameters)) for candidate in candidates]
@@ -122,23 +142,14 @@ def calibrate(
         values, effect = (value, parameter.read(settings), low, high), 100.0 * each.effect
         named = parameter.name, parameter.setting, parameter.unit
         estimates.append(Estimate(*named, *values, status, each.reason, effect, parameter.kind == "log"))
-    progress(1.0)
     scores = tuple(fit.errors(fitted.thread_length) for fit in fits)
-    result = CalibrationResult(fitted, runs[0].against, tuple(estimates), attachment, scores, replays.best.replays)
+    result = CalibrationResult(fitted, runs[0].against, tuple(estimates), attachment, scores, replays.count)
     return result, fits
 
 
-def unfinished_result(
-    runs: Sequence[RecordedRun], settings: ThreadModelSettings, best: BestSettings
-) -> tuple[CalibrationResult, list[BagFit]]:
-    """Return the best that an interrupted search had come to, without intervals.
-
-    Args:
-        runs: recorded runs.
-        settings: where it started.
-        best: of the search; its settings must be known.
-    """
-    found = best.settings or settings
+def _unfinished_result(replays: Replays, settings: ThreadModelSettings) -> tuple[CalibrationResult, list[BagFit]]:
+    """Return the best that an interrupted search from some settings had come to, without intervals."""
+    found, runs = replays.best or settings, replays.runs
     parameters = [p for p in OF_FORMULATION[settings.formulation] if p.read(found) != p.read(settings)]
     estimates = tuple(
         Estimate(p.name, p.setting, p.unit, p.read(found), p.read(settings), status=UNFINISHED) for p in parameters
@@ -146,10 +157,9 @@ def unfinished_result(
     attachment = None
     if found.attachment != settings.attachment:
         attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
-    fits = [BagFit(*parts) for parts in zip(runs, best.first, best.vertices, strict=True)]
+    fits = [BagFit(*parts) for parts in zip(runs, replays.first_vertices, replays.best_vertices, strict=True)]
     scores = tuple(fit.errors(found.thread_length) for fit in fits)
-    result = CalibrationResult(found, runs[0].against, estimates, attachment, scores, best.replays, finished=False)
-    return result, fits
+    return CalibrationResult(found, runs[0].against, estimates, attachment, scores, replays.count, finished=False), fits
 
 
 def _robust_fit(objective: Objective) -> FitSolution:
