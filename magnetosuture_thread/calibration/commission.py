@@ -196,7 +196,7 @@ class Commissioning:
         verification = np.array(errors).reshape(-1, 2)
         rig = model.parameters
         findings = (*find_wiring(self._believed, rig.angles, np.sign(rig.fields)), *self._changes(rig))
-        failures = tuple(self._failures(model, verification))
+        failures = tuple(self._failures(verification))
         ends = tuple(self._pulses), tuple(wide), tuple(history)
         return Commissioned(tuple(answers), model, findings, failures, verification, math.nan, *ends)
 
@@ -382,7 +382,7 @@ class Commissioning:
             return []
         return [f"the needle is {1e3 * rig.length:.2f} mm long, not {1e3 * believed:.2f} mm"]
 
-    def _failures(self, model: PulseModel, errors: Vector) -> list[str]:
+    def _failures(self, errors: Vector) -> list[str]:
         """Return why the verification failed."""
         if len(errors) < VERIFIED:
             return [f"only {len(errors)} of {VERIFIED} pulses could be verified: place the needle in the middle"]

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,32 +277,28 @@ class PulseModel:
         held = np.where(np.isin(self.names, ("distance", "radius", "length")), 0.05, 1.0)
         ways = ([self._weak * held] if not self._starts else []) + [self._weak] * ROUNDS
         self._starts += [pulse.poses[0].copy() for pulse in pulses[len(self._starts) :]]
-        before, weights = math.inf, np.ones(1)
+        before = math.inf
         for weak in ways:
             self._starts = [self.start_of(pulse, start) for pulse, start in zip(pulses, self._starts, strict=True)]
             # An orthonormal basis of what the start of a pulse can change.
             bases = [np.linalg.qr(self.by_start(q, s))[0] for q, s in zip(pulses, self._starts, strict=True)]
-            residuals = partial(self._residuals, pulses, bases, weak, 1.0)
-            weighted = partial(self._residuals, pulses, bases, weak, np.sqrt(weights))
-            slope = partial(derivative, weighted)
-            solved = least_squares(weighted, self._p, slope, method="lm", ftol=1e-4, max_nfev=12)
-            self._p, found = solved.x, residuals(solved.x)
-            weights = np.minimum(1.0, OUTLIER / np.maximum(np.abs(found), 1e-9))
-            cost = float(weights @ found**2)
-            if cost > before * (1.0 - 1e-3):
+            residuals = partial(self._residuals, pulses, bases, weak)
+            options: dict[str, Any] = {"loss": "huber", "f_scale": OUTLIER, "ftol": 1e-4, "max_nfev": 12}
+            solved = least_squares(residuals, self._p, partial(derivative, residuals), **options)
+            self._p = solved.x
+            if solved.cost > before * (1.0 - 1e-3):
                 break
-            before = cost
-        self._estimate(pulses, found, weights, derivative(residuals, self._p))
+            before = solved.cost
+        weights = np.minimum(1.0, OUTLIER / np.maximum(np.abs(solved.fun), 1e-9))
+        self._estimate(pulses, solved.fun, weights, derivative(residuals, self._p))
 
-    def _residuals(
-        self, pulses: Sequence[Pulse], bases: Sequence[Vector], weak: Vector, scale: Vector | float, p: Vector
-    ) -> Vector:
-        """Return what is left of all pulses, and of what was known before, in deviations, times a scale."""
+    def _residuals(self, pulses: Sequence[Pulse], bases: Sequence[Vector], weak: Vector, p: Vector) -> Vector:
+        """Return what is left of all pulses, and of what was known before, in deviations."""
         rig, blocks = self._at(p), []
         for pulse, start, basis in zip(pulses, self._starts, bases, strict=True):
             block = (difference(rig.poses(pulse, start), pulse.poses) / self._sigma).ravel()
             blocks.append(block - basis @ (basis.T @ block))
-        return scale * np.concatenate([*blocks, (p - self._prior) / weak])
+        return np.concatenate([*blocks, (p - self._prior) / weak])
 
     def _estimate(self, pulses: Sequence[Pulse], residuals: Vector, weights: Vector, jacobian: Vector) -> None:
         """Estimate the covariance of the parameters from residuals, their weights and derivatives at the solution."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, as_numbers, finite_array
+from magnetosuture_thread.geometry.scene import MAX_NAME_CHARS, is_name
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, shortened
 
@@ -23,7 +24,6 @@ ENHANCED_CONNECTIVITY, STIFFNESS, WALL = "enhanced_connectivity", "stiffness", "
 BUILT_IN = (CONNECTIVITY, COMPRESSION, OBSTACLE, ENHANCED_CONNECTIVITY, STIFFNESS, WALL)
 """Names of the barriers that the formulations bring."""
 MAX_BARRIERS = 32
-MAX_NAME_CHARS = 64
 
 
 class Gradient(NamedTuple):
@@ -230,7 +230,7 @@ def check_barriers(barriers: tuple[Barrier, ...]) -> None:
         if not isinstance(barrier, Barrier):
             raise ConfigurationError(f"barriers[{index}]", barrier, "an instance of a subclass of Barrier")
         name = barrier.name
-        if not (isinstance(name, str) and 0 < len(name) <= MAX_NAME_CHARS and name.isprintable()):
+        if not is_name(name):
             raise ConfigurationError(f"barriers[{index}].name", name, f"1 to {MAX_NAME_CHARS} printable characters")
         if name in taken:
             raise ConfigurationError(f"barriers[{index}].name", name, "a name that no other barrier has")

@@ -17,7 +17,6 @@ import difflib
 import inspect
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields
@@ -46,8 +45,8 @@ from magnetosuture_thread.geometry.scene import (
 from magnetosuture_thread.geometry.shapes import Disc, Polygon, Ring, Vertex, triangulate
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import bounded, errors_of_file, read_yaml, suggest_names
-from magnetosuture_thread.settings.errors import ConfigurationError
-from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, find_file, output_problem, read_regular
+from magnetosuture_thread.settings.errors import BagError, ConfigurationError
+from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, find_file, read_regular, whole_file
 
 GEOJSON_ENDINGS = (".json", ".geojson")
 COMMON = ("kind", "corner_radius", "friction")  # fields of all shapes
@@ -514,17 +513,11 @@ def write_scene(scene: Scene, path: Path) -> None:
         text = json.dumps(scene_to_geojson(scene), indent=1, allow_nan=False) + "\n"
     else:
         text = yaml.safe_dump(scene_to_mapping(scene), sort_keys=False, default_flow_style=None, width=120)
-    problem = output_problem(path)
-    if not problem:
-        partial = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
+    try:
+        with whole_file(path) as partial:
             partial.write_text(text, encoding="utf-8")
-            partial.replace(path)
-        except OSError as error:
-            partial.unlink(missing_ok=True)
-            problem = error.strerror or str(error)
-    if problem:
-        raise ConfigurationError("scene file", problem, "a file that can be written", str(path))
+    except BagError as error:
+        raise ConfigurationError("scene file", error.problem, "a file that can be written", str(path)) from None
 
 
 @dataclass(frozen=True)

@@ -246,7 +246,6 @@ class RunResult:
         seed: of the run.
         success: whether all goals were reached, in truth too, and all limits held.
         reason: why not; empty if so.
-        reached: whether all goals were reached, as far as the nodes know.
         goals_met: how many were.
         figures: of the run.
         simulated_s: simulated time that the run took, with the time before the procedure began.
@@ -257,7 +256,6 @@ class RunResult:
     seed: int
     success: bool
     reason: str
-    reached: bool
     goals_met: int
     figures: RunFigures
     simulated_s: float
@@ -357,7 +355,7 @@ def run_procedure(
     met = len(procedure.goals) if reached else execution.goal
     instants, closest = extremes.last_instants() if reasons else (), extremes.closest if reasons else None
     words = "; ".join(reasons)
-    return RunResult(variation.seed, not reasons, words, reached, met, figures, rig.time, instants, closest)
+    return RunResult(variation.seed, not reasons, words, met, figures, rig.time, instants, closest)
 
 
 class _Pilot:

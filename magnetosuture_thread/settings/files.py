@@ -103,28 +103,25 @@ def read_regular(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
     return content
 
 
-def check_yaml(text: str, *, max_aliases: int = 0, plain: bool = False) -> None:
+def check_yaml(text: str, *, plain: bool = False) -> None:
     """Refuse a YAML text that becomes much larger when it is read, or that nests too deep.
 
     Args:
         text: from outside.
-        max_aliases: that are accepted; each may double what is read.
         plain: whether tags, and numbers that are not written in decimal digits, are refused too.
 
     Raises:
         BudgetError: with the line.
         yaml.YAMLError: it is no YAML.
     """
-    depth = aliases = 0
+    depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=yaml.CSafeLoader)):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        is_anchor = not max_aliases and getattr(event, "anchor", None) is not None
-        aliases += is_anchor or isinstance(event, yaml.AliasEvent)
         value = event.value if plain and isinstance(event, yaml.ScalarEvent) and event.implicit[0] else ""
         problem = ""
         if depth > MAX_YAML_DEPTH:
             problem = f"lists and mappings {depth} deep"
-        elif aliases > max_aliases:
+        elif getattr(event, "anchor", None) is not None:  # each alias may double what is read
             problem = "an anchor or alias (& or *)"
         elif plain and getattr(event, "tag", None) not in (None, "!"):
             problem = "a tag (!)"

@@ -31,13 +31,13 @@ def instant(time: float, clearance: float = 0.004) -> RunInstant:
 def failed(seed: int, figures: RunFigures, reason: str, closest: RunInstant) -> RunResult:
     """Return a run that failed."""
     instants = tuple(instant(76.0 + 0.8 * k) for k in range(6))
-    return RunResult(seed, False, reason, False, 2, figures, 82.0, instants, closest)
+    return RunResult(seed, False, reason, 2, figures, 82.0, instants, closest)
 
 
 @pytest.mark.parametrize("failures", [0, 14])
 def test_a_campaign_is_drawn_with_the_dish_of_each_failed_run(failures: int):
     close = replace(GOOD, min_needle_clearance_m=0.0002)
-    runs = [RunResult(0, True, "", True, 5, GOOD, 81.0)]
+    runs = [RunResult(0, True, "", 5, GOOD, 81.0)]
     runs += [failed(seed, close, "too <close>", instant(20.0, 0.0002)) for seed in range(1, failures + 1)]
     result = CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, 0.02, runs)
     picture = imread(io.BytesIO(draw_campaign(result)), format="png")[..., :3]
