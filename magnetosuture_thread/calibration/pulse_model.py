@@ -200,10 +200,10 @@ def difference(poses: Vector, others: Vector) -> Vector:
     return np.asarray(apart)
 
 
-def derivative(function: Residuals, p: Vector) -> Vector:
-    """Return the derivative of a function of parameters by differences, shape (rows, n)."""
-    here = function(p)
-    return np.asarray(np.array([(function(p + STEP * row) - here) / STEP for row in np.eye(len(p))]).T)
+def derivative(function: Residuals, p: Vector, steps: Vector | float = STEP) -> Vector:
+    """Return the derivative of a function of parameters by differences of a step in each, shape (rows, n)."""
+    here, rows = function(p), np.diag(np.broadcast_to(steps, p.shape))
+    return np.asarray(np.array([(function(p + row) - here) / row.sum() for row in rows]).T)
 
 
 class PulseModel:
@@ -251,15 +251,12 @@ class PulseModel:
 
     def by_parameters(self, pulse: Pulse, start: Vector) -> Vector:
         """Return how the predicted poses change by the parameters, in deviations, shape (3 k, n)."""
-        here, size = self.parameters.poses(pulse, start), len(self._p)
-        moved = [self._at(self._p + STEP * row).poses(pulse, start) for row in np.eye(size)]
-        return np.asarray(((np.array(moved) - here) / (STEP * self._sigma)).reshape(size, -1).T)
+        return derivative(lambda p: (self._at(p).poses(pulse, start) / self._sigma).ravel(), self._p)
 
     def by_start(self, pulse: Pulse, start: Vector) -> Vector:
         """Return how the predicted poses change by the pose at the start, in deviations, shape (3 k, 3)."""
-        rig, here = self.parameters, self.parameters.poses(pulse, start)
-        moved = [(rig.poses(pulse, start + row) - here) / row.sum() for row in np.diag(START_STEP)]
-        return np.asarray((np.array(moved) / self._sigma).reshape(3, -1).T)
+        rig = self.parameters
+        return derivative(lambda pose: (rig.poses(pulse, pose) / self._sigma).ravel(), start, START_STEP)
 
     def start_of(self, pulse: Pulse, start: Vector) -> Vector:
         """Return the start that fits a pulse's frames best, by two steps of Gauss and Newton from a guess."""

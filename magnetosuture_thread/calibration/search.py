@@ -449,27 +449,20 @@ class Identifiability(NamedTuple):
     effect: float
 
 
-class Uncertainty(NamedTuple):
-    """How well numbers are determined.
-
-    Attributes:
-        half: half of the 95 % interval of each, in the scale of the fit, shape (P,).
-        effect: mean size of d residual / d x of each that no other makes up for, as a share of the length, shape (P,).
-        correlation: of their estimates, from J' W J, shape (P, P).
-    """
-
-    half: Array
-    effect: Array
-    correlation: Array
-
-
-def estimate_uncertainty(solution: FitSolution, runs: Sequence[RecordedRun], columns: Sequence[int]) -> Uncertainty:
+def estimate_uncertainty(
+    solution: FitSolution, runs: Sequence[RecordedRun], columns: Sequence[int]
+) -> tuple[Array, Array, Array]:
     """Return how well some of a solution's numbers are determined, the others taken as they are.
 
     Args:
         solution: of a fit.
         runs: that it was fitted to.
         columns: of the numbers.
+
+    Returns:
+        Half of the 95 % interval of each, in the scale of the fit, shape (P,); mean size of d residual / d x of each
+        that no other makes up for, as a share of the length, shape (P,); and the correlation of their estimates, from
+        J' W J, shape (P, P).
     """
     jacobian = [j[..., list(columns)] for j in solution.jacobian]
     flat = np.concatenate([j[run.known] for j, run in zip(jacobian, runs, strict=True)])
@@ -487,7 +480,7 @@ def estimate_uncertainty(solution: FitSolution, runs: Sequence[RecordedRun], col
     half = _half(inverse, np.array(blocks))
     if len(runs) >= 3:
         half = np.maximum(half, _half(inverse, np.array(whole)))
-    return Uncertainty(half / size + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
+    return half / size + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation
 
 
 def _half(inverse: Array, scores: Array) -> Array:
@@ -526,16 +519,16 @@ def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -
             found[index] = Identifiability(reason, np.inf, 0.0)
     left = [index for index in range(len(parameters)) if index not in found]
     while left:
-        uncertainty = estimate_uncertainty(solution, runs, left)
-        half, effect = uncertainty.half.tolist(), (uncertainty.effect * counts[left]).tolist()
-        pairs = np.abs(uncertainty.correlation - np.eye(len(left)))
+        halves, effects, correlation = estimate_uncertainty(solution, runs, left)
+        half, effect = halves.tolist(), (effects * counts[left]).tolist()
+        pairs = np.abs(correlation - np.eye(len(left)))
         if pairs.max() <= 0.95:
             for index, own_half, own_effect in zip(left, half, effect, strict=True):
                 reason = _reason(solution, index, own_effect, own_half, runs)
                 found[index] = Identifiability(reason, own_half, own_effect)
             break
         one, other = sorted(np.unravel_index(int(pairs.argmax()), pairs.shape), key=lambda place: effect[place])
-        name, value = parameters[left[other]].name, uncertainty.correlation[one, other]
+        name, value = parameters[left[other]].name, correlation[one, other]
         reason = f"cannot be told apart from {name}: correlation {value:.2f}"
         found[left.pop(one)] = Identifiability(reason, half[one], effect[one])
     return [found[index] for index in range(len(parameters))]

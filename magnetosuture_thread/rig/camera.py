@@ -57,7 +57,6 @@ LOOKS = {
     "tissue": Look((196.0, 194.0, 242.0), (178.0, 184.0, 236.0), 0.7e-3, 9.0, 8.0),
     "hernia": Look((164.0, 166.0, 226.0), (150.0, 162.0, 212.0), 0.5e-3, 6.0, 4.0),
 }
-LOOK_OF_KIND = {"tissue": "tissue", "instrument": "silicone", "wall": "silicone"}  # of a scene's shapes
 
 
 @dataclass(frozen=True)

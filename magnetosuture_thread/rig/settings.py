@@ -14,7 +14,7 @@ from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene, find_collision
-from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting
+from magnetosuture_thread.rig.camera import LOOKS, CameraScene, DishCamera, Lighting
 from magnetosuture_thread.rig.contact import Surface
 from magnetosuture_thread.rig.dynamics import CoilField, NeedleBody, RigDynamics
 from magnetosuture_thread.rig.power import StageProcess
@@ -228,10 +228,10 @@ class RigSettings(
         return DishView((0.5 * self.camera_width + 2.0, 0.5 * self.camera_height - 2.0), scale)
 
     def camera(self, scene: Scene) -> DishCamera:
-        """Return the camera over the dish; shapes look as `obstacle_looks` says of all of them, else by their kind."""
+        """Return the camera over the dish; shapes look as `obstacle_looks` says, else as their kind, or silicone."""
         names = self.obstacle_looks if len(self.obstacle_looks) == len(scene.shapes) else ()
         needle = self.needle_length, self.needle_width, self.needle_curvature
-        looks = tuple(LOOKS[name] for name in names or [LOOK_OF_KIND[shape.kind] for shape in scene.shapes])
+        looks = tuple(LOOKS.get(name, LOOKS["silicone"]) for name in names or [shape.kind for shape in scene.shapes])
         seen = CameraScene(scene.dish.diameter, *needle, self.thread_diameter, obstacles=scene.obstacles, looks=looks)
         lighting = Lighting(gain=self.light_gain, noise=self.noise)
         return DishCamera(seen, self.view(scene), (self.camera_width, self.camera_height), self.seed, lighting)

@@ -17,7 +17,6 @@ from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.shared_parameters import EVERY_NODE, key_matches, names_of, read_sections
 
 RANDOM, SEEDS = "random:", 2**31
-SECTION = f"{EVERY_NODE}/{RigSettings.GROUP}"
 # A thread that the mechanics take and that does nothing: a stub with less than a thousandth of a needle's drag.
 NO_THREAD: dict[str, Any] = {
     "thread_length": 1e-3,
@@ -71,7 +70,9 @@ def _read_rig(rig: RigSettings, path: Path) -> RigSettings:
     shared = [{k: v for k, v in values.items() if k in known} for key, values in sections if key == EVERY_NODE]
     own = [values for key, values in sections if key != EVERY_NODE and key_matches(key, f"/{RigSettings.GROUP}")]
     if not own:
-        raise ConfigurationError("rig", [key for key, _ in sections], f"a section {SECTION}", str(path))
+        raise ConfigurationError(
+            "rig", [key for key, _ in sections], f"a section {EVERY_NODE}/{RigSettings.GROUP}", str(path)
+        )
     truth: dict[str, Any] = to_mapping(rig)
     for values in (*shared, *own):
         truth |= values

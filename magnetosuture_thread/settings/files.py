@@ -38,8 +38,6 @@ _SUBSTITUTES = {
     b"#ROSBAG V": "is a bag of ROS 1; convert it by: rosbags-convert --src FILE.bag --dst FOLDER",
 }
 HEAD_BYTES = max(map(len, _SUBSTITUTES))
-_CHECKOUT = Path(__file__).resolve().parents[2]
-_IN_CHECKOUT = {"magnetosuture_thread": _CHECKOUT, "magnetosuture_msgs": _CHECKOUT / "msg_defs"}
 # Where files of a kind are in the share directory, and how their names end.
 _YAML = (".yaml", ".yml")
 _SHIPPED = {
@@ -255,7 +253,8 @@ def share_directory(package: str) -> Path:
     prefixes = [prefix for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
     schemes = [scheme for scheme in sysconfig.get_scheme_names() if scheme.startswith("posix")]
     prefixes += [sysconfig.get_path("data", scheme) for scheme in schemes]
-    folders = [_IN_CHECKOUT[package], *(Path(prefix) / "share" / package for prefix in prefixes)]
+    checkout = Path(__file__).resolve().parents[2] / ("msg_defs" if package == "magnetosuture_msgs" else "")
+    folders = [checkout, *(Path(prefix) / "share" / package for prefix in prefixes)]
     for folder in folders:
         if (folder / "package.xml").is_file():
             return folder
