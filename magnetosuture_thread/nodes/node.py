@@ -221,7 +221,11 @@ class GuardedNode(Node):
         return False
 
     def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
-        """Do the work of this node, and of all others in its executor, until it is over."""
+        """Do the work of this node, and of all others in its executor, until it is over, at its real-time priority."""
+        if self.has_parameter("realtime_priority"):
+            scheduling = raise_priority(self.get_parameter("realtime_priority").value)
+            self.health.note(**{SCHEDULING: scheduling})
+            self.get_logger().info(f"{SCHEDULING}: {scheduling}")
         executor.spin_until(is_over)
 
     def refuse(self, problem: Exception) -> None:
@@ -411,13 +415,6 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         Only called where some parameters are not fixed.
         """
         raise NotImplementedError
-
-    def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
-        """Do the work of this node, and of all others in its executor, at its real-time priority."""
-        scheduling = raise_priority(self.get_parameter("realtime_priority").value)
-        self.health.note(**{SCHEDULING: scheduling})
-        self.get_logger().info(f"{SCHEDULING}: {scheduling}")
-        super().spin(executor, is_over)
 
     def may_start(self) -> bool:
         """Return whether the node may become active by itself at its start."""
