@@ -16,6 +16,7 @@ from magnetosuture_thread.coils.filter import SPEED, NeedleSafetyFilter
 from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist
 from magnetosuture_thread.geometry.compiled import TypedKernel, compiled
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 Vector = NDArray[np.float64]
 Certificate = Callable[["Allocation"], tuple[float, str]]
@@ -483,6 +484,9 @@ class CoilAllocation:
             balance: b, to the needle's left [T].
             at_tip: whether the tip is to move as it would by that motion: then the needle turns against what the
                 currents add across it, and errors do not count. Else it turns as commanded.
+
+        Raises:
+            InvalidInputError: something is not finite, or the needle lies on a coil's winding.
         """
         e, lever = self._needle.chord_direction(heading), 0.5 * self._needle.chord
         n, middle = np.array([-e[1], e[0]]), tail + lever * e
@@ -494,6 +498,9 @@ class CoilAllocation:
         along, across, turn_rate, place, stamp, torque = map(float, (*twist, *deviation, balance))
         request = Request(along, across, turn_rate, place, stamp, torque, bool(at_tip), before, lower, upper)
         currents = self._allocate(self._data, request, *middle.tolist(), *e.tolist())
+        if not np.isfinite(currents).all():
+            what = (*twist, *tail, *heading)
+            raise InvalidInputError("motion, tail and heading", what, "finite numbers, and a needle off the coils")
         found = self.motion(currents, tail, heading, balance)
         wanted = twist.along * e + (lever * twist.turn_rate + twist.across) * n
         inaccurate = math.hypot(*(found.velocity - wanted)) > SATURATION_TOLERANCE * math.hypot(*wanted)

@@ -68,8 +68,7 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
 
     Without an option the whole graph is started around a simulated rig, with the coils disarmed, and any setup
     can be chosen on the page. --graph serves the page on the graph that runs on this ROS domain, --replay on a
-    bag that is played through the nodes over and over, which nobody can jog. Around a simulated rig vision_tracker
-    and thread_model get a real-time priority, where the system allows any, so that the browser does not delay them.
+    bag that is played through the nodes over and over, which nobody can jog.
 
     The page is served on this machine alone unless --address and a token say otherwise. Without a token each
     start makes its own, which is in the address that is printed. A token in the environment, as

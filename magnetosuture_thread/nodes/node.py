@@ -221,12 +221,15 @@ class GuardedNode(Node):
         return False
 
     def spin(self, executor: KeptWaitSetExecutor, is_over: Callable[[], bool]) -> None:
-        """Do the work of this node, and of all others in its executor, until it is over, at its real-time priority."""
+        """Do the work of this node, and of all others in its executor, until it is over."""
+        executor.spin_until(is_over)
+
+    def take_priority(self) -> None:
+        """Give the process the real-time priority that a parameter of this node says, and report what it got."""
         if self.has_parameter("realtime_priority"):
             scheduling = raise_priority(self.get_parameter("realtime_priority").value)
             self.health.note(**{SCHEDULING: scheduling})
             self.get_logger().info(f"{SCHEDULING}: {scheduling}")
-        executor.spin_until(is_over)
 
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""
@@ -295,11 +298,13 @@ def _take_clock(node: Callable[[], Any], callback: Callable[..., object], data: 
 
 
 def _check_parameters(reference: Callable[[], Any], parameters: list[Parameter]) -> SetParametersResult:
-    """Refuse another clock for a node that keeps its own."""
+    """Refuse a parameter without a name, which rclpy would declare, and another clock for a node that keeps its own."""
     node, reason = reference(), ""
     now = node.get_parameter("use_sim_time").value
     for parameter in parameters:
-        if parameter.name == "use_sim_time" and node.is_configured and parameter.value is not now:
+        if not parameter.name:
+            reason = "a parameter without a name"
+        elif parameter.name == "use_sim_time" and node.is_configured and parameter.value is not now:
             reason = str(ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now"))
     return SetParametersResult(successful=not reason, reason=reason)
 

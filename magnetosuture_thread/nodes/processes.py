@@ -212,8 +212,14 @@ def raise_priority(priority: int) -> str:
 
 
 def leave_priority() -> None:
-    """Schedule this thread as ordinary ones: a worker that takes long must not hold up what is due."""
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    """Schedule this thread as ordinary ones, if it has inherited a real-time priority.
+
+    For a worker that takes long, which must not hold up other processes. Where these keep it from running while it has
+    Python's lock, its own process waits with it.
+    """
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 class Interruption:

@@ -121,6 +121,8 @@ def run(make: Callable[[], GuardedNode | tuple[GuardedNode, ...]], arguments: Se
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
+        for node in nodes:
+            node.take_priority()
         nodes[0].spin(executor, lambda: is_ending.is_set() or all(node.has_ended for node in nodes))
         for node in nodes:
             node.finish()

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
+PRIORITY = 11  # of SCHED_FIFO, where permitted: above that of every node
 ACKNOWLEDGED = b"\xff"
 ADDRESSES = range(0x80, 0x88)
 
@@ -433,8 +434,8 @@ def _serve(pipe: Connection, ports: Sequence[str], supply: float, resistance: fl
     """Open a stage, send how that went, and its currents as often as asked, until nobody can ask any more."""
     os.setsid()  # Ctrl-C is for the rig, which then takes the boards away
     with suppress(OSError):  # only some may
-        # Before the processes that boards would not share a processor with, where the user may say so.
-        os.nice(-10)
+        # Before all nodes, with which boards would not share a processor; threads inherit it.
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     stage = PowerStage(ports, supply, resistance, inductance)
     try:
         stage.open()

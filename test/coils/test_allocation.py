@@ -22,6 +22,7 @@ from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.needle_motion import NeedleTwist
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 NEEDLE = CoilBridgeSettings().needle()
 COILS = LoopCoils(coils_around((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3))
@@ -93,6 +94,13 @@ def test_saturation_is_reported_with_the_velocity_really_reached():
     assert found.saturated
     assert np.abs(found.currents).max() == pytest.approx(0.5)
     assert 0.0 < found.velocity[0] < 0.01
+
+
+@pytest.mark.parametrize(("along", "x", "cosine"), [(np.nan, 0.0, 1.0), (0.001, np.inf, 1.0), (0.001, 0.0, np.nan)])
+def test_what_is_not_finite_is_refused(along: float, x: float, cosine: float):
+    allocation = CoilAllocation(COILS, NEEDLE, 0.008, 10.0)
+    with pytest.raises(InvalidInputError, match="finite"):
+        allocation.allocate(NeedleTwist(along), np.array([x, 0.0]), np.array([cosine, 0.0]))
 
 
 @pytest.mark.parametrize("unknowns", [3, 4, 6, 8])
