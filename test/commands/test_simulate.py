@@ -163,7 +163,7 @@ def test_a_run_whose_bridge_is_stopped_ends_with_the_reason(scenario: Path, tmp_
 
 def test_a_procedure_that_nobody_resumes_ends_the_run_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(simulate_command, "MAX_PAUSE", 1.0)
-    (tmp_path / "near.yaml").write_text(NEAR)
+    (tmp_path / "near.yaml").write_text(NEAR.replace("speed: 0.003", "speed: 0.0002"))  # which leaves time to pause it
     (tmp_path / "open.yaml").write_text(OPEN)
 
     def pause(share: float) -> None:
