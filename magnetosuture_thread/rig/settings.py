@@ -95,13 +95,6 @@ class RigSettings(
     GROUP: ClassVar[str] = "rig_simulator"
 
     rate: float = quantity(1.0, "how much faster /clock runs, where use_sim_time is set", minimum=0.5, maximum=5.0)
-    realtime_priority: int = quantity(
-        3,
-        "real-time priority of the process, where permitted, as hardware waits for no program; below those that steer; "
-        "0 for none",
-        minimum=0,
-        maximum=99,
-    )
     seed: int = quantity(0, "of dust, sensor noise and faults", minimum=0, maximum=2**31 - 1)
     faults: tuple[str, ...] = quantity((), "what goes wrong: KIND START DURATION each, in s since the first current")
 
