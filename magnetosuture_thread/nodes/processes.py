@@ -192,7 +192,8 @@ def raise_priority(priority: int) -> str:
     """Give all threads of this process a real-time priority, and return the result as text.
 
     Under the ordinary scheduling a process that wakes up waits for others that are busy, here by up to some
-    milliseconds. Threads that begin later inherit the priority.
+    milliseconds. Threads that begin later inherit the priority. What computes most of the time must not have any:
+    ordinary threads of the kernel pass on the bytes of serial lines, and stand still while all processors are taken.
 
     Args:
         priority: of SCHED_FIFO, 1 to 99; with 0 all stays as it is.
