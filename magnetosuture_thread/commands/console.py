@@ -28,8 +28,7 @@ from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, Participant
 from magnetosuture_thread.nodes.console import NAME, RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
-from magnetosuture_thread.nodes.processes import NodeProcesses
-from magnetosuture_thread.nodes.program import STOPS
+from magnetosuture_thread.nodes.processes import STOPS, NodeProcesses
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError

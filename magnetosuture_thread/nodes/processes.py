@@ -17,12 +17,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.settings.errors import GraphError
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
 
+STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LIBC = ctypes.CDLL(None)  # loaded here, and not between fork and exec
 
 # What could lead a graph out of this machine or to another graph.

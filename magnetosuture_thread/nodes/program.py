@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import MagnetosutureError
+from magnetosuture_thread.nodes.processes import STOPS
 from magnetosuture_thread.settings.errors import missing_module
 from magnetosuture_thread.settings.interface import ALL_NODES
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.node import GuardedNode
 
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LOADING_GRACE = 1.0  # s to end in order for a process that is asked to while it loads
 DELIVERY_TIMEOUT = 0.2  # s for the last messages of all nodes to be acknowledged
 
