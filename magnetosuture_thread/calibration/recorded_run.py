@@ -290,7 +290,7 @@ class Replays:
         log: called with a line at the end of each stage.
 
     Attributes:
-        runs: as given.
+        runs: that are replayed.
         best: settings of the least mean prediction error over the runs so far; None before anything is known.
         best_vertices: predicted with them, of each run.
         first_vertices: predicted with the settings that were tried first.

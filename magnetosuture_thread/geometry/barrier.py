@@ -231,7 +231,9 @@ def check_barriers(barriers: tuple[Barrier, ...]) -> None:
             raise ConfigurationError(f"barriers[{index}]", barrier, "an instance of a subclass of Barrier")
         name = barrier.name
         if not is_name(name):
-            raise ConfigurationError(f"barriers[{index}].name", name, f"1 to {MAX_NAME_CHARS} printable characters")
+            raise ConfigurationError(
+                f"barriers[{index}].name", name, f"1 to {MAX_NAME_CHARS} printable characters, no blank at an end"
+            )
         if name in taken:
             raise ConfigurationError(f"barriers[{index}].name", name, "a name that no other barrier has")
         Quantity("", "1/s", minimum=1e-6, unlimited=True).checked(f"{name}.gain", barrier.gain)

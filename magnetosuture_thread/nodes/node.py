@@ -35,7 +35,7 @@ from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.parameters import declare, plain_value
-from magnetosuture_thread.nodes.processes import raise_priority
+from magnetosuture_thread.nodes.processes import raise_priority, without_priority
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError, shortened
@@ -120,7 +120,8 @@ class Health:
         worker.start()
         Health.loading += 1
         try:
-            yield
+            with without_priority():  # of a node that is configured while it runs
+                yield
         finally:
             Health.loading -= 1
             done.set()

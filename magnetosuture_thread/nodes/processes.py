@@ -212,6 +212,19 @@ def raise_priority(priority: int) -> str:
     return f"real time, priority {priority}"
 
 
+@contextmanager
+def without_priority() -> Iterator[None]:
+    """Leave the real-time priority of this thread meanwhile: who compiles for a minute must not take a processor."""
+    scheduling = os.sched_getscheduler(0), os.sched_getparam(0)
+    leave_priority()
+    try:
+        yield
+    finally:
+        if scheduling[0] == os.SCHED_FIFO:
+            with suppress(OSError):
+                os.sched_setscheduler(0, *scheduling)
+
+
 def leave_priority() -> None:
     """Schedule this thread as ordinary ones, if it has inherited a real-time priority.
 

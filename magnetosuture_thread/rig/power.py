@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
-PRIORITY = 11  # of SCHED_FIFO, where permitted: above that of every node
+PRIORITY = 11  # of SCHED_FIFO, where permitted: above what nodes have by default
 ACKNOWLEDGED = b"\xff"
 ADDRESSES = range(0x80, 0x88)
 
@@ -434,7 +434,7 @@ def _serve(pipe: Connection, ports: Sequence[str], supply: float, resistance: fl
     """Open a stage, send how that went, and its currents as often as asked, until nobody can ask any more."""
     os.setsid()  # Ctrl-C is for the rig, which then takes the boards away
     with suppress(OSError):  # only some may
-        # Before all nodes, with which boards would not share a processor; threads inherit it.
+        # Before the nodes, with which boards would not share a processor; threads inherit it.
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     stage = PowerStage(ports, supply, resistance, inductance)
     try:

@@ -194,12 +194,16 @@ def test_a_process_gets_its_priority_as_far_as_permitted_and_its_workers_are_ord
     code = """
 import os
 from concurrent.futures import ThreadPoolExecutor
-from magnetosuture_thread.nodes.processes import leave_priority, raise_priority
+from magnetosuture_thread.nodes.processes import leave_priority, raise_priority, without_priority
 said = raise_priority(5)
 assert said == {os.SCHED_FIFO: "real time, priority 5"}.get(os.sched_getscheduler(0), said), said
 assert os.sched_getscheduler(0) == os.SCHED_FIFO or "priority 5 refused" in said, said
 with ThreadPoolExecutor(1, initializer=leave_priority) as workers:
     assert workers.submit(os.sched_getscheduler, 0).result() == os.SCHED_OTHER
+before = os.sched_getscheduler(0)
+with without_priority():
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+assert os.sched_getscheduler(0) == before
 assert raise_priority(0) == "ordinary"
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
