@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
@@ -75,12 +76,12 @@ class RigSimulatorNode(GuardedNode):
             self._clocks = topics.CLOCK.publisher(self)
             self.every(PERIOD / rate, self.on_clock)
         self.every(1.0 / (settings.frame_rate * rate), self.on_frame)
-        self._stage = stage = settings.power()  # simulated boards; None where currents come as messages
-        if stage is None:
+        self._stage = settings.power()  # simulated boards; None where currents come as messages
+        if self._stage is None:
             topics.RIG_CURRENTS.subscribe(self, self.on_currents)
         else:
-            stage.open()
-            self.every(PERIOD, lambda: self._apply(stage.currents()))
+            self._stage.open()
+            self.every(PERIOD, self.on_boards)
         self.get_logger().info("ready: everything here is simulated")
 
     def on_scene(self, scene: Scene) -> None:
@@ -90,7 +91,14 @@ class RigSimulatorNode(GuardedNode):
 
     def on_currents(self, message: CoilCurrents) -> None:
         """Apply the coils' currents of a message."""
-        self._apply(np.asarray(message.current, dtype=float))
+        now = self.time.elapsed()
+        self._apply(np.asarray(message.current, dtype=float), now, now)
+
+    def on_boards(self) -> None:
+        """Let what has flowed since the last look act in the time in which it has, however late this look is."""
+        assert self._stage is not None
+        currents, until = self._stage.currents()
+        self._apply(currents, self.rig.time, self.time.elapsed() - (time.monotonic() - until))
 
     def on_fault(self, message: String) -> None:
         """Apply a fault that begins now."""
@@ -109,6 +117,8 @@ class RigSimulatorNode(GuardedNode):
         if self.time.paused:
             self.health.ok("paused")
             return
+        if self._stage is not None:  # else a frame would be ahead of what the boards give
+            self.on_boards()
         elapsed = self.time.elapsed()
         if self._phase is None:
             self._phase = elapsed
@@ -139,16 +149,17 @@ class RigSimulatorNode(GuardedNode):
         left_out = 0.0 if self._simulated else self.time.stood + self.time.lag
         return self.time.start + round((elapsed + left_out) * 1e9)
 
-    def _apply(self, currents: NDArray[np.float64]) -> None:
-        elapsed = self.time.elapsed()
+    def _apply(self, currents: NDArray[np.float64], since: float, until: float) -> None:
+        """Let currents act since a time, and the rig move on until another one [s]."""
         try:
-            self.rig.apply(currents, elapsed)
+            self.rig.apply(currents, since)
+            self.rig.advance(until)
         except InvalidInputError as error:
             self.refuse(error)
             return
         except MagnetosutureError as error:
             self._fail(error)
-        self._leave_out(elapsed - self.rig.time)
+        self._leave_out(until - self.rig.time)
 
     def _leave_out(self, behind: float) -> None:
         """Let the time lag by what the rig is behind [s]: what it had no time for it never makes good."""

@@ -85,6 +85,7 @@ class RoboClawBoard:
     Attributes:
         duties: in force, from -32767 to 32767.
         currents: in the two coils [A].
+        charges: that have flowed through them, the integrals of the currents [A s].
         timeout: of the serial line, in tenths of a second; 0 is none.
         limits: of the currents, in units of 10 mA.
         errors: bits that stop it, as in its status.
@@ -100,7 +101,7 @@ class RoboClawBoard:
         self, address: int = 0x80, supply: float = 24.0, resistance: float = 1.0, inductance: float = 0.01
     ) -> None:
         self.address, self.supply, self.resistance, self.inductance = address, supply, resistance, inductance
-        self.duties, self.currents = (0, 0), (0.0, 0.0)
+        self.duties, self.currents, self.charges = (0, 0), (0.0, 0.0), (0.0, 0.0)
         self.timeout, self.limits = 0, [*FACTORY_LIMITS]
         self.errors = self.warnings = 0
         self.ignored, self.broken = set[int](), set[int]()
@@ -150,12 +151,16 @@ class RoboClawBoard:
     def _move(self, time: float) -> None:
         if time <= self._time:
             return
-        share, currents = math.exp(-(time - self._time) * self.resistance / self.inductance), [0.0, 0.0]
+        span, currents, charges = time - self._time, [0.0, 0.0], [*self.charges]
+        share = math.exp(-span * self.resistance / self.inductance)
         for channel in {0, 1} - self.broken:
             current, limit = self.currents[channel], 0.01 * self.limits[channel]
             goal = self.duties[channel] / FULL * self.supply / self.resistance
             currents[channel] = max(-limit, min(limit, goal + (current - goal) * share))
-        self.currents, self._time = (currents[0], currents[1]), time
+            if span < math.inf:
+                charge = goal * span + (current - goal) * (1.0 - share) * self.inductance / self.resistance
+                charges[channel] += max(-limit * span, min(limit * span, charge))
+        self.currents, self.charges, self._time = (currents[0], currents[1]), (charges[0], charges[1]), time
 
     def _set(self, duties: tuple[int, int], time: float) -> None:
         if duties != self.duties:
@@ -355,15 +360,20 @@ class PowerStage:
         for line in self.lines:
             line.unplug()
 
-    def currents(self) -> NDArray[np.float64]:
-        """Return the coils' currents now, shape (2 boards,) [A]."""
+    def charges(self) -> tuple[float, list[float]]:
+        """Return a monotonic time [s], and the charges that have flowed through the coils until then [A s]."""
+        now = time.monotonic()
         for line in self.lines:
-            line.advance()
-        return np.array([current for board in self.boards for current in board.currents])
+            with line.lock:
+                for board in line.boards:
+                    board.advance(now)
+        return now, [charge for board in self.boards for charge in board.charges]
 
 
 class StageProcess:
     """Runs a power stage elsewhere, and reads its currents; the boards go when this process does, whatever ends it.
+
+    They are read as charges: what reads late, or at odd times, loses nothing of what has flowed meanwhile.
 
     Args:
         ports: the path at which each board is to be found, as `PowerStage` takes them.
@@ -376,6 +386,7 @@ class StageProcess:
         self._arguments = list(ports), supply, resistance, inductance
         self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None
+        self._read = (0.0, np.zeros(2 * len(ports)))  # last time [s], and the charges until then
 
     @property
     def pid(self) -> int | None:
@@ -397,6 +408,7 @@ class StageProcess:
         if (problem := self._receive()) is not None:
             self.close()
             raise ConfigurationError(*problem)
+        self._read = time.monotonic(), np.zeros(2 * len(self._arguments[0]))
 
     def close(self) -> None:
         """Take the boards away; harmless if there are none."""
@@ -408,8 +420,8 @@ class StageProcess:
         self._process.join()
         self._process = self._pipe = None
 
-    def currents(self) -> NDArray[np.float64]:
-        """Return the coils' currents now, shape (2 boards,) [A].
+    def currents(self) -> tuple[NDArray[np.float64], float]:
+        """Return the coils' mean currents since the last call, shape (2 boards,) [A], and until when [s].
 
         Raises:
             GraphError: the boards are not open, or the process ended.
@@ -417,7 +429,9 @@ class StageProcess:
         if self._pipe is not None:
             with suppress(OSError):  # receiving tells
                 self._pipe.send(None)
-        return np.asarray(self._receive())
+        now, flowed = self._receive()
+        (before, known), self._read = self._read, (now, np.asarray(flowed))
+        return (self._read[1] - known) / (now - before), now
 
     def _receive(self) -> Any:
         if self._pipe is None or self._process is None:
@@ -431,7 +445,7 @@ class StageProcess:
 
 
 def _serve(pipe: Connection, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
-    """Open a stage, send how that went, and its currents as often as asked, until nobody can ask any more."""
+    """Open a stage, send how that went, and its charges as often as asked, until nobody can ask any more."""
     os.setsid()  # Ctrl-C is for the rig, which then takes the boards away
     with suppress(OSError):  # only some may
         # Before the nodes, with which boards would not share a processor; threads inherit it.
@@ -446,5 +460,5 @@ def _serve(pipe: Connection, ports: Sequence[str], supply: float, resistance: fl
         pipe.send(None)
         while True:
             pipe.recv()
-            pipe.send(stage.currents())
+            pipe.send(stage.charges())
     stage.close()

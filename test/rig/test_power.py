@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, Line, RoboClawBoard, StageProcess, checksum
@@ -18,6 +19,7 @@ from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
 # Of the supply: a half, and a quarter reversed.
 HALF_AND_BACK = bytes((129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))
+ZEROS = bytes((129, Command.SET_DUTIES, 0, 0, 0, 0))
 RIG = """
 import sys, time
 from magnetosuture_thread.rig.power import StageProcess
@@ -45,17 +47,47 @@ def wait(condition: Callable[[], bool], what: str) -> None:
 
 
 def test_boards_elsewhere_are_written_to_here_and_their_currents_read(stage, tmp_path):
-    assert stage.currents() == pytest.approx(4 * [0.0])
+    assert stage.currents()[0] == pytest.approx(4 * [0.0])
     device = os.open(tmp_path / "b", os.O_RDWR | os.O_NOCTTY)
     try:
         os.write(device, HALF_AND_BACK + checksum(HALF_AND_BACK).to_bytes(2, "big"))
         assert os.read(device, 1) == ACKNOWLEDGED
-        wait(lambda: stage.currents() == pytest.approx([0.0, 0.0, 12.0, -6.0], abs=0.05), "the currents")
+        wait(lambda: stage.currents()[0] == pytest.approx([0.0, 0.0, 12.0, -6.0], abs=0.05), "the currents")
     finally:
         os.close(device)
     stage.close()
     stage.close()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_look_that_comes_late_gets_all_that_has_flowed(stage, tmp_path):
+    _, begin = stage.currents()
+    device = os.open(tmp_path / "b", os.O_RDWR | os.O_NOCTTY)
+    try:
+        for packet in (HALF_AND_BACK, ZEROS):
+            os.write(device, packet + checksum(packet).to_bytes(2, "big"))
+            assert os.read(device, 1) == ACKNOWLEDGED
+            time.sleep(0.1)
+    finally:
+        os.close(device)
+    currents, end = stage.currents()
+    flowed = (end - begin) * currents[2:]
+    assert flowed[1] == pytest.approx(-0.5 * flowed[0], rel=1e-3)
+    assert 0.1 * 12.0 <= flowed[0] < (end - begin - 0.1) * 12.0 + 0.01  # the fall lets flow what the rise did not
+
+
+def test_the_charge_of_a_coil_is_the_integral_of_its_current():
+    board, times = RoboClawBoard(), np.arange(0.0, 0.2, 1e-4)
+    currents = []
+    for now in times:
+        board.receive(b"", now)
+        if now in (times[100], times[1200]):
+            packet = HALF_AND_BACK if now == times[100] else ZEROS
+            packet = bytes((board.address, *packet[1:]))
+            board.receive(packet + checksum(packet).to_bytes(2, "big"), now)
+        currents.append(board.currents)
+    assert board.charges == pytest.approx(np.trapezoid(currents, times, axis=0), rel=1e-3)
+    assert board.charges[0] == pytest.approx(0.11 * 12.0, rel=1e-3)
 
 
 def test_ctrl_c_is_for_the_rig(stage):
