@@ -41,6 +41,7 @@ VERIFIED = 12  # pulses
 MEDIAN_ERROR, WORST_ERROR, HEADING_ERROR = 0.05, 0.20, math.radians(3.0)  # of the verdict
 CHECK_ERROR = 0.12  # of the way; beyond it a rig is another one, and a coil at 0.8 is
 SQUARE_ERROR = 1e-3  # m; of the verdict too
+THINNED = 3  # a frame of so many tells on which side a coil is
 LEAST_WAY = 3e-4  # m; a shorter displacement counts as this one, for it is measured to some micrometres
 FRAME_TIME = 0.02  # s; between predicted poses of a design; no pulse is shorter, however early it ends
 
@@ -172,7 +173,7 @@ class Commissioning:
         dead = [coil for coil in coils if not answers[coil].moved]
         if dead:
             return Commissioned(tuple(answers), failures=(no_answer(dead, len(coils)),), pulses=tuple(self._pulses))
-        model = PulseModel(on_their_sides(self._guess(answers), self._pulses), deviations)
+        model = PulseModel(on_their_sides(self._guess(answers), self._pulses, deviations), deviations)
         model.fit(self._pulses)
         self._log(f"ladder: {len(self._pulses)} pulses, residual {math.sqrt(model.chi_square):.2f} deviations")
         top = max(answer.current for answer in answers)
@@ -398,28 +399,33 @@ class Commissioning:
         return [words for failed, words in checks if failed]
 
 
-def on_their_sides(rig: RigParameters, pulses: Sequence[Pulse]) -> RigParameters:
-    """Return a rig whose coils are on the side of the dish to which their own pulses have turned the needle.
+def on_their_sides(rig: RigParameters, pulses: Sequence[Pulse], deviations: Vector) -> RigParameters:
+    """Return a guess with each coil on the side of the dish for which a fit is better.
 
     A needle that lies along a field moves towards the coil, one that lies against it away, and rests there until chance
-    turns it. Of both sides, with the sign of the field that explains the same motion, the one is taken whose predicted
-    headings h are nearer to those that were measured, by the sum of sin^2((h - h') / 2).
+    turns it: one coil by itself has moved it in the same way from either side.
 
     Args:
         rig: a guess.
         pulses: of the ladder.
+        deviations: of a measured pose, shape (3,) [m, m, rad].
     """
-    angles = rig.angles.copy()
-    for coil in range(len(angles)):
-        ladder = [pulse for pulse in pulses if pulse.currents[coil] and np.count_nonzero(pulse.currents) == 1]
-        costs = []
-        for turn in (0.0, math.pi):
-            tried = replace(rig, angles=angles + turn * (np.arange(len(angles)) == coil))
-            errors = [tried.poses(pulse, pulse.poses[0])[:, 2] - pulse.poses[:, 2] for pulse in ladder]
-            costs.append(sum(float((np.sin(0.5 * error) ** 2).sum()) for error in errors))
-        if costs[1] < costs[0]:
-            angles[coil] += math.pi
-    return replace(rig, angles=angles)
+    some = [replace(pulse, times=pulse.times[::THINNED], poses=pulse.poses[::THINNED]) for pulse in pulses]
+
+    def error(guess: RigParameters) -> float:
+        model = PulseModel(guess, deviations)
+        model.fit(some, rounds=1)
+        return model.chi_square
+
+    best, least = rig, error(rig)
+    while True:  # until none is better: what a coil explains may be another one's
+        rig, before = best, least
+        for turned in np.pi * np.eye(len(rig.angles)):
+            other = replace(rig, angles=rig.angles + turned)
+            if (tried := error(other)) < least:
+                best, least = other, tried
+        if least == before:
+            return rig
 
 
 def no_answer(dead: Sequence[int], count: int) -> str:

@@ -266,13 +266,13 @@ class PulseModel:
             start = start + change * min(1.0, 0.3 / max(1e-9, abs(float(change[2]))))
         return start
 
-    def fit(self, pulses: Sequence[Pulse]) -> None:
-        """Fit to pulses, from the last fit on."""
+    def fit(self, pulses: Sequence[Pulse], rounds: int = ROUNDS) -> None:
+        """Fit to pulses, from the last fit on; the first fit has one round more, in which sizes are held."""
         from scipy.optimize import least_squares  # here, as it takes long to import
 
         # The first pulses tell drags and strengths from a bad guess only if sizes are held as a ruler has them.
         held = np.where(np.isin(self.names, ("distance", "radius", "length")), 0.05, 1.0)
-        ways = ([self._weak * held] if not self._starts else []) + [self._weak] * ROUNDS
+        ways = ([self._weak * held] if not self._starts else []) + [self._weak] * rounds
         self._starts += [pulse.poses[0].copy() for pulse in pulses[len(self._starts) :]]
         before = math.inf
         for weak in ways:

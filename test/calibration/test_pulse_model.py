@@ -90,20 +90,26 @@ def test_nothing_moves_before_the_delay_is_over():
     assert np.abs(found[TIMES > 0.17] - found[0]).max(axis=1).min() > 1e-3
 
 
-def test_a_coil_that_was_believed_on_the_other_side_by_a_needle_against_its_field_is_put_right():
-    truth, pulses = parameters(), []
+@pytest.mark.parametrize(
+    ("current", "residual", "turned"), [(0.3, (4e-5, -6e-5), (1, 0, 1, 0)), (0.1, (-9e-5, 4e-5), (0, 0, 1, 0))]
+)
+def test_a_coil_that_was_believed_on_the_other_side_by_a_needle_against_its_field_is_put_right(
+    current, residual, turned
+):
+    truth, pulses = parameters(residual=np.array(residual)), []
     for coil in range(4):
         # From nearly against the field, where the needle is pushed away, until it has turned round.
         against = ANGLES[coil] + (0.0 if truth.fields[coil] < 0.0 else math.pi)
         for start in (against + 0.03, against + 1.2):
-            given = pulse([0.3 * (k == coil) for k in range(4)])
+            given = pulse([current * (k == coil) for k in range(4)])
             poses = truth.poses(given, np.array([-0.003, 0.0, start]))
             pulses.append(replace(given, poses=poses))
     rough = parameters(drag=tuple(1.5 * drag for drag in NEEDLE.drag), residual=np.zeros(2), delay=0.0)
-    wrong = replace(rough, angles=ANGLES + 0.1 + math.pi * np.array([1, 0, 1, 0]))
-    apart = np.abs(np.exp(1j * on_their_sides(wrong, pulses).angles) - np.exp(1j * ANGLES))
+    wrong = replace(rough, angles=ANGLES + 0.1 + math.pi * np.array(turned))
+    deviations = np.array([5e-6, 5e-6, 2e-3])
+    apart = np.abs(np.exp(1j * on_their_sides(wrong, pulses, deviations).angles) - np.exp(1j * ANGLES))
     assert apart.max() < 0.11
-    np.testing.assert_array_equal(on_their_sides(rough, pulses).angles, rough.angles)
+    np.testing.assert_array_equal(on_their_sides(rough, pulses, deviations).angles, rough.angles)
 
 
 def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
