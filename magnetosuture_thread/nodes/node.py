@@ -262,7 +262,7 @@ class GuardedNode(Node):
         offered: Any = self.create_service(topics.ros_class(service.type_name), service, answer)
         offered.sent = 0
 
-    def every(self, period: float, callback: Callable[[], None]) -> None:
+    def every(self, period: float, callback: Callable[[], object]) -> None:
         """Call back each period [s] of a steady clock: simulated time may stand still."""
         self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 

@@ -81,6 +81,7 @@ class RigSimulatorNode(GuardedNode):
             topics.RIG_CURRENTS.subscribe(self, self.on_currents)
         else:
             self._stage.open()
+            self.rig.advance(self.time.elapsed())  # nothing has flowed until now
             self.every(PERIOD, self.on_boards)
         self.get_logger().info("ready: everything here is simulated")
 
@@ -94,11 +95,13 @@ class RigSimulatorNode(GuardedNode):
         now = self.time.elapsed()
         self._apply(np.asarray(message.current, dtype=float), now, now)
 
-    def on_boards(self) -> None:
-        """Let what has flowed since the last look act in the time in which it has, however late this look is."""
+    def on_boards(self) -> float:
+        """Let what has flowed since the last look act in the time in which it has; return the time of this look [s]."""
         assert self._stage is not None
         currents, until = self._stage.currents()
-        self._apply(currents, self.rig.time, self.time.elapsed() - (time.monotonic() - until))
+        elapsed = self.time.elapsed() - (time.monotonic() - until)
+        self._apply(currents, self.rig.time, elapsed)
+        return elapsed
 
     def on_fault(self, message: String) -> None:
         """Apply a fault that begins now."""
@@ -117,9 +120,8 @@ class RigSimulatorNode(GuardedNode):
         if self.time.paused:
             self.health.ok("paused")
             return
-        if self._stage is not None:  # else a frame would be ahead of what the boards give
-            self.on_boards()
-        elapsed = self.time.elapsed()
+        # No frame is ahead of what is known of the boards.
+        elapsed = self.time.elapsed() if self._stage is None else self.on_boards()
         if self._phase is None:
             self._phase = elapsed
         index = math.floor((elapsed - self._phase) * self._settings.frame_rate + 0.1)  # a tick may be early

@@ -17,7 +17,7 @@ import time
 import tty
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from enum import IntEnum
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -158,9 +158,18 @@ class RoboClawBoard:
             goal = self.duties[channel] / FULL * self.supply / self.resistance
             currents[channel] = max(-limit, min(limit, goal + (current - goal) * share))
             if span < math.inf:
-                charge = goal * span + (current - goal) * (1.0 - share) * self.inductance / self.resistance
-                charges[channel] += max(-limit * span, min(limit * span, charge))
+                charges[channel] += self._charge(current, goal, limit, span)
         self.currents, self.charges, self._time = (currents[0], currents[1]), (charges[0], charges[1]), time
+
+    def _charge(self, current: float, goal: float, limit: float, span: float) -> float:
+        """Return the charge of a coil whose current goes from one to a goal, as far as its limit [A s]."""
+        tau, at_limit = self.inductance / self.resistance, math.copysign(limit, goal)
+        rises = span
+        if abs(goal) > limit:
+            # Its limit may be lower than a current that flows.
+            left = max(0.0, (at_limit - current) / (goal - current)) if goal != current else 0.0
+            rises = min(span, -tau * math.log1p(-left))
+        return goal * rises + (current - goal) * tau * -math.expm1(-rises / tau) + at_limit * (span - rises)
 
     def _set(self, duties: tuple[int, int], time: float) -> None:
         if duties != self.duties:
@@ -362,12 +371,13 @@ class PowerStage:
 
     def charges(self) -> tuple[float, list[float]]:
         """Return a monotonic time [s], and the charges that have flowed through the coils until then [A s]."""
-        now = time.monotonic()
-        for line in self.lines:
-            with line.lock:
-                for board in line.boards:
-                    board.advance(now)
-        return now, [charge for board in self.boards for charge in board.charges]
+        with ExitStack() as locks:
+            for line in self.lines:
+                locks.enter_context(line.lock)
+            now = time.monotonic()
+            for board in self.boards:
+                board.advance(now)
+            return now, [charge for board in self.boards for charge in board.charges]
 
 
 class StageProcess:

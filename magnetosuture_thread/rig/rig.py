@@ -179,6 +179,8 @@ class Rig:
         self.currents = np.zeros(len(settings.coil_angles))
         self._commands = deque[tuple[float, Vector]]()  # that are not in force yet, and from when on they are
         self._max_time, self._max_iterations = max_time, max_iterations
+        # Simulated boards switch off by themselves, as their currents then say.
+        self._timeout = settings.driver_timeout if settings.power_stage == "topic" else math.inf
         self.problem, self.is_watched = "", True
         self._asked_at = -math.inf  # last time that currents were asked for since the problem
 
@@ -270,7 +272,7 @@ class Rig:
             self.time = max(self.time, time)
             return
         limit = self.time + self._max_time
-        off_at = max(self.time, self._applied_at + self._settings.driver_timeout)
+        off_at = max(self.time, self._applied_at + self._timeout)
         try:
             if self.began == math.inf:  # what it has no time for is left out, as nothing else waits for the thread
                 if (span := min(time, limit) - self.time) > 0.0 and self.is_watched:

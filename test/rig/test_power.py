@@ -76,18 +76,21 @@ def test_a_look_that_comes_late_gets_all_that_has_flowed(stage, tmp_path):
     assert 0.1 * 12.0 <= flowed[0] < (end - begin - 0.1) * 12.0 + 0.01  # the fall lets flow what the rise did not
 
 
-def test_the_charge_of_a_coil_is_the_integral_of_its_current():
-    board, times = RoboClawBoard(), np.arange(0.0, 0.2, 1e-4)
-    currents = []
+@pytest.mark.parametrize("limit", [30.0, 9.0])
+def test_the_charge_of_a_coil_is_the_integral_of_its_current(limit: float):
+    board, late, times, currents = RoboClawBoard(), RoboClawBoard(), np.arange(0.0, 0.2, 1e-4), []
+    board.limits = late.limits = [round(100.0 * limit)] * 2
     for now in times:
         board.receive(b"", now)
         if now in (times[100], times[1200]):
             packet = HALF_AND_BACK if now == times[100] else ZEROS
             packet = bytes((board.address, *packet[1:]))
-            board.receive(packet + checksum(packet).to_bytes(2, "big"), now)
+            for one in (board, late):
+                one.receive(packet + checksum(packet).to_bytes(2, "big"), now)
         currents.append(board.currents)
+    late.advance(times[-1])
     assert board.charges == pytest.approx(np.trapezoid(currents, times, axis=0), rel=1e-3)
-    assert board.charges[0] == pytest.approx(0.11 * 12.0, rel=1e-3)
+    assert late.charges == pytest.approx(board.charges, rel=1e-3)
 
 
 def test_ctrl_c_is_for_the_rig(stage):
