@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Protocol
@@ -41,7 +42,7 @@ VERIFIED = 12  # pulses
 MEDIAN_ERROR, WORST_ERROR, HEADING_ERROR = 0.05, 0.20, math.radians(3.0)  # of the verdict
 CHECK_ERROR = 0.12  # of the way; beyond it a rig is another one, and a coil at 0.8 is
 SQUARE_ERROR = 1e-3  # m; of the verdict too
-THINNED = 3  # a frame of so many tells on which side a coil is
+THINNED = 3  # one frame in so many is enough to tell on which side a coil is
 LEAST_WAY = 3e-4  # m; a shorter displacement counts as this one, for it is measured to some micrometres
 FRAME_TIME = 0.02  # s; between predicted poses of a design; no pulse is shorter, however early it ends
 
@@ -414,8 +415,10 @@ def on_their_sides(rig: RigParameters, pulses: Sequence[Pulse], deviations: Vect
 
     def error(guess: RigParameters) -> float:
         model = PulseModel(guess, deviations)
-        model.fit(some, rounds=1)
-        return model.chi_square
+        with suppress(ValueError, np.linalg.LinAlgError):  # from a wrong side a fit may lead nowhere
+            model.fit(some, rounds=1)
+            return model.chi_square
+        return math.inf
 
     best, least = rig, error(rig)
     while True:  # until none is better: what a coil explains may be another one's
@@ -424,7 +427,7 @@ def on_their_sides(rig: RigParameters, pulses: Sequence[Pulse], deviations: Vect
             other = replace(rig, angles=rig.angles + turned)
             if (tried := error(other)) < least:
                 best, least = other, tried
-        if least == before:
+        if not least < before:
             return rig
 
 
