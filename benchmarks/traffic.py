@@ -19,8 +19,9 @@ from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.program import run
 
 RATES = {"commander": 50.0, "tracker": 60.0, "fuzzer": 1000.0}  # Hz
-SPEED = 0.001  # m/s; too slow for the bridge to judge whether a needle follows whose pose is always the same
+SPEED = 0.001  # m/s
 TAIL, HEADING = np.array([-0.0035, 0.0]), np.array([1.0, 0.0])
+REVERSAL = 1.0  # s; of a command, so that a needle which follows it stays where it is
 
 
 class TrafficNode(GuardedNode):
@@ -43,7 +44,9 @@ class TrafficNode(GuardedNode):
         self._random = random.Random(7)
         self._began = time.monotonic()
         self._last: float | None = None
-        self._direction = 0.0
+        self._place, self._velocity, self._heard = TAIL, np.zeros(2), 0.0  # of a needle that does as it is told
+        if self._kind == "tracker":
+            topics.NEEDLE_COMMAND.subscribe(self, self._hear)
         act = {"commander": self._command, "tracker": self._track, "fuzzer": self._fuzz}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0 / RATES[self._kind], act[self._kind], clock=steady)
@@ -56,13 +59,18 @@ class TrafficNode(GuardedNode):
                 self._last = None
             if now - self._began < self._burst + self._pause * (0.8 + 0.4 * self._random.random()):
                 return
-            self._began, self._direction = now, self._direction + 1.0
-        velocity = SPEED * np.array([math.cos(self._direction), math.sin(self._direction)])
+            self._began = now
+        velocity = math.copysign(SPEED, math.sin(math.pi * now / REVERSAL)) * HEADING
         self._last = time.monotonic()
         self._commands.publish(packed_twist(self._stamp(), velocity))
 
+    def _hear(self, message: Any) -> None:
+        self._velocity, self._heard = np.array([message.twist.linear.x, message.twist.linear.y]), time.monotonic()
+
     def _track(self) -> None:
-        self._poses.publish(packed_pose(self._stamp(), TAIL, HEADING))
+        if time.monotonic() - self._heard < 0.1:  # as long as the bridge drives
+            self._place = self._place + self._velocity / RATES["tracker"]
+        self._poses.publish(packed_pose(self._stamp(), self._place, HEADING))
 
     def _fuzz(self) -> None:
         """Publish a command or a pose with something wrong in it, or nothing."""
