@@ -15,6 +15,8 @@ Vector = NDArray[np.float64]
 
 PLACE_DEVIATION = 1.2e-5  # m; of a tracked middle
 PULL_NOISE = 1e-4  # m^2/s^3; a pull changes by 10 mm/s, root mean square, in 1 s
+SWING_SHARE = 0.5  # of the way of the middle in a turn about the tail: a thread holds the tail, or does not
+SWING_TIME = 0.05  # s; of a turn by `MAX_BLIND_TURN` at 7 rad/s, as across a coil's axis, in which that share is one
 VISIBLE = 6e-5  # m; four times the noise of a displacement between two poses
 MAX_STILL = 0.3  # s; after which poses that have not visibly moved are the place that the next ones are compared with
 MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
@@ -50,7 +52,11 @@ class MotionObserver:
         p' = p + T (c + d),    d' = d + noise,    var = PULL_NOISE T
 
     p is measured with the variance PLACE_DEVIATION^2 + x^2, where x is half of the difference of T c between the
-    intervals one deviation of the stamps earlier and later.
+    intervals one deviation of the stamps earlier and later. A needle that a field turns, with the unit vector e along
+    its chord l by de, moves p by a share of l de / 2, from none about its middle to all about a tail that a thread
+    holds. So (`SWING_SHARE` l |de| / 2)^2, times `SWING_TIME` / T where that is greater than 1, adds to the variance
+    of p', with the part of de that the field was set to make: a turn is no pull. Compensated by poses 0.1 s old, it
+    would throw the needle back and forth.
     d is at most `max_speed`, by the force that a thread can have. The coils compensate d: for the motion u they are set
     to c = u - d. Where the needle moves at k c, d converges with poses up to 0.4 s late for k from 0.5 to 1.5, so the
     drag of the model is the needle's own: that of the thread is a part of the pull.
@@ -72,7 +78,7 @@ class MotionObserver:
         limit_pair(0.0, 0.0, max_speed)  # loaded now, and not within the loop
         self._place, self._velocity, self._covariance = np.zeros(2), np.zeros(2), np.zeros((2, 2))
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
-        self._seen: tuple[float, Vector] | None = None  # the last pose that counted
+        self._seen: tuple[float, Vector, Vector] | None = None  # the last pose that counted, as `_last`
         self._interval = 0.0  # between poses [s]
         self._innovation = math.nan  # of the last pose, squared over its variance
         self._applied: deque[tuple[float, Vector]] = deque()  # what the currents were set for, each with its start
@@ -121,30 +127,31 @@ class MotionObserver:
         last, self._last = self._last, (stamp, middle, e)
         if last is None or not 0.0 < stamp - last[0] <= MAX_GAP:
             self._velocity, self._seen = np.zeros(2), None
-        self._learn(stamp, middle, trusted, stamp_deviation)
+        self._learn(self._last, trusted, stamp_deviation)
         interval = 0.0 if last is None else stamp - last[0]
         self._interval = interval if 0.0 < interval <= MAX_GAP else self._interval
         applied = self._mean_applied(stamp - interval, stamp) if 0.0 < interval <= MAX_GAP else None
         if last is None or applied is None:
             return None
-        before = last[2]
-        turn = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
-        swing = 0.5 * self._needle.chord * (e - before)
+        turn, swing = self._turned(last[2], e)
         expected, turned = interval * applied[2:4], interval * applied[4]
         driven, measured = interval * applied[:2], middle - last[1]
         seen = driven, self._velocity, self._innovation
         return MotionStep(stamp, interval, expected, turned, measured, turn, swing, *seen)
 
-    def _learn(self, stamp: float, middle: Vector, trusted: bool, deviation: float) -> None:
-        """Update the filter with a measured middle, shape (2,) [m], if that counts."""
-        seen, self._innovation = self._seen, math.nan
+    def _learn(self, pose: tuple[float, Vector, Vector], trusted: bool, deviation: float) -> None:
+        """Update the filter with a measured pose, see `_last`, if that counts."""
+        (stamp, middle, direction), seen, self._innovation = pose, self._seen, math.nan
         interval = math.inf if seen is None else stamp - seen[0]
         applied = self._mean_applied(stamp - interval, stamp) if interval <= MAX_STILL else None
         if seen is None or applied is None:
-            self._seen = stamp, middle
+            self._seen = pose
             self._place, self._covariance = middle, np.diag([PLACE_DEVIATION**2, PULL_NOISE * MAX_GAP])
             return
         place, covariance = self._predicted(interval, applied[:2])
+        turn, swing = self._turned(seen[2], direction)
+        swing = _share_of_field(interval * applied[4], turn) * swing
+        covariance[0, 0] += SWING_SHARE**2 * float(swing @ swing) * max(1.0, SWING_TIME / interval)
         early, late = (self._mean_applied(stamp - interval + by, stamp + by) for by in (-deviation, deviation))
         change = np.zeros(5) if early is None or late is None else 0.5 * interval * (late - early)
         noise, doubt = covariance[0, 0] + PLACE_DEVIATION**2, float(change[:2] @ change[:2])
@@ -155,11 +162,16 @@ class MotionObserver:
         velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
         is_seen = trusted or not applied[:2].any() or math.hypot(*(middle - seen[1])) > VISIBLE
         if is_seen or math.hypot(*velocity) < math.hypot(*self._velocity):
-            self._seen, self._velocity = (stamp, middle), velocity
+            self._seen, self._velocity = pose, velocity
             self._place, self._covariance = (
                 place + gain[0] * (middle - place),
                 covariance - np.outer(gain, covariance[0]),
             )
+
+    def _turned(self, before: Vector, after: Vector) -> tuple[float, Vector]:
+        """Return the turn between two directions of the chord [rad], and the way of the middle about the tail [m]."""
+        turn = math.atan2(before[0] * after[1] - before[1] * after[0], float(before @ after))
+        return turn, 0.5 * self._needle.chord * (after - before)
 
     def _predicted(self, interval: float, applied: Vector) -> tuple[Vector, Vector]:
         """Return place [m] and covariance after an interval [s] with a velocity by the currents, shape (2,) [m/s]."""
@@ -347,8 +359,7 @@ class FollowMonitor:
             if span < MIN_WINDOW:
                 field_turn, turn = field_turn + entry.expected_turn, turn + entry.measured_turn
                 swing = swing + entry.swing
-                shared = min(1.0, max(0.0, field_turn / turn)) if turn else 0.0
-                about_tail = shared * swing
+                about_tail = _share_of_field(field_turn, turn) * swing
                 error = self._error(expected, measured, about_tail)
             span, distance = span + entry.interval, math.hypot(*expected)
             if span >= MIN_WINDOW and distance >= min_distance:
@@ -438,6 +449,11 @@ class FollowMonitor:
             return self._suspicion
         self._probed, self._followed, self._trusted_until = None, stamp, stamp + TRUST_TIME
         return ""
+
+
+def _share_of_field(field_turn: float, turn: float) -> float:
+    """Return which share of a measured turn the field was set to make, 0 to 1."""
+    return min(1.0, max(0.0, field_turn / turn)) if turn else 0.0
 
 
 def _distance(point: Vector, side: Vector) -> float:

@@ -80,6 +80,21 @@ def test_the_place_of_a_needle_that_is_held_is_known_as_that_of_one_that_moves()
     assert held == observed(0.0, 3e-3, 0.0, (8e-3, 0.0)).place_deviation(2.98)
 
 
+@pytest.mark.parametrize("interval", [1.0 / 60.0, 0.05])
+@pytest.mark.parametrize("is_driven", [True, False])
+def test_a_turn_by_the_field_about_a_tail_that_a_thread_holds_is_no_pull(is_driven: bool, interval: float):
+    """Of 0.35 rad at 7 rad/s, as across a coil's axis; another turn of poses says as much of a pull as before."""
+    observer, angle, swiftest = MotionObserver(NEEDLE.kinematics, max_speed=NEEDLE.max_pull_speed), 0.3, 0.0
+    for k in range(round(2.0 / interval)):
+        now = 1.0 + k * interval
+        rate = 7.0 if 1.5 <= now < 1.549 else 0.0
+        observer.update(np.zeros(2), direction(angle), now, trusted=True)
+        observer.apply(now, np.zeros(2), np.zeros(2), rate if is_driven else 0.0)
+        angle += rate * interval
+        swiftest = max(swiftest, math.hypot(*observer.velocity))
+    assert (swiftest < 1.2e-3) if is_driven else (swiftest > 3e-3)
+
+
 def test_after_a_gap_between_poses_nothing_is_known():
     observer = observed(0.0, 0.0, 1e-3, (0.0, 0.0))
     observer.update(np.zeros(2), direction(0.3), 4.0)
