@@ -64,9 +64,10 @@ def test_the_axis_of_a_needle_without_a_thread_is_published_and_its_pose_once_a_
     tracking = graph.listen(topics.TRACKER_STATE)
     ends = np.array([[-0.004, 0.002], [0.003, 0.002]])
     graph.publish(topics.COMPRESSED_IMAGE, compressed(rod(ends), graph.now()))
+    # On a busy machine the camera seems to be silent right after the only frame: look at every state.
     graph.wait(lambda: bool(poses and tracking), "an axis")
-    assert tracking[-1].state != TrackerState.STATE_TRACKED
-    assert "not which end is the tip" in tracking[-1].reason
+    graph.wait(lambda: any("not which end is the tip" in state.reason for state in tracking), "the reason")
+    assert all(state.state != TrackerState.STATE_TRACKED for state in tracking)
     assert np.reshape(poses[-1].pose.covariance, (6, 6))[5, 5] > 1.0
     graph.wait(lambda: any(value.key == "axis_mm" for value in diagnostics[-1].status[0].values), "the axis")
     tip = PointStamped()
@@ -77,7 +78,8 @@ def test_the_axis_of_a_needle_without_a_thread_is_published_and_its_pose_once_a_
     graph.publish(topics.NEEDLE_TIP, tip)
     graph.wait(lambda: node._session is not None and node._session._tracker._tip is not None, "the point")
     graph.publish(topics.COMPRESSED_IMAGE, compressed(rod(ends), graph.now()))
-    graph.wait(lambda: tracking[-1].state == TrackerState.STATE_TRACKED and len(poses) > 1, "a pose")
+    tracked = TrackerState.STATE_TRACKED
+    graph.wait(lambda: any(state.state == tracked for state in tracking) and len(poses) > 1, "a pose")
     position = poses[-1].pose.pose.position
     assert np.hypot(position.x - ends[1, 0], position.y - ends[1, 1]) < 2e-4
 
