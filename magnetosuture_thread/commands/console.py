@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AsyncExitStack, ExitStack, closing, suppress
 from dataclasses import replace
@@ -20,13 +20,15 @@ from typing import Any
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.calibration.commission_files import SUMMARY_FILE
 from magnetosuture_thread.commands import command, live
+from magnetosuture_thread.commands.measurement import DONE, FAILED, RUNNING, Measurement, taught_values
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.evaluation.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox, Participant
+from magnetosuture_thread.nodes.clients import Inbox, Participant, Services, restart, services_to_restart
 from magnetosuture_thread.nodes.console import NAME, RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.processes import STOPS, NodeProcesses
 from magnetosuture_thread.rig.setups import Setup, read_setup
@@ -36,6 +38,9 @@ from magnetosuture_thread.settings.files import share_directory, whole_folder
 from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
+TRACKER = "vision_tracker"
+TEACH, COMMISSION, CANCEL = "teach", "commission", "cancel"
+TAUGHT_TIME = 1.0  # s of frames, in the first of which the needle is marked
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
@@ -215,12 +220,17 @@ class RecordingHost(GraphHost):
         self.setup, self.busy, self.log = setup, "", log
         self._recordings = recordings
         self._recording: BagRecording | None = None
+        self._tracker = Services(graph.node, services_to_restart(TRACKER))
+        self._measurement: Measurement | None = None
+        self._measuring: asyncio.Task[None] | None = None
+        self._commissioned: Path | None = None  # the last commissioning, which goes on if it is not finished
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
         recording = "" if self._recording is None else str(self._recording.output)
         state = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
-        return {**super().state(), **state}
+        measurement = self._measurement and self._measurement.shown()
+        return {**super().state(), **state, "can_measure": True, "measurement": measurement}
 
     def notes(self, operator: str) -> dict[str, str]:
         """Return the notes of a recording, which the page that has control began.
@@ -234,6 +244,12 @@ class RecordingHost(GraphHost):
 
     def start(self) -> None:
         """Start what this runs; here nothing."""
+
+    def at_work(self) -> str:
+        """Return what has to end before anything else begins; empty if nothing has to."""
+        if self._measurement is not None and self._measurement.state == RUNNING:
+            return f"{self._measurement.name} is running; cancel it first"
+        return self.busy
 
     async def set_recording(self, recording: bool, operator: str) -> str:
         """Start or end a recording; return an empty text, or the reason of a refusal."""
@@ -255,6 +271,26 @@ class RecordingHost(GraphHost):
         self.log(f"recording to {bag.output}")
         return ""
 
+    async def measure(self, action: str, marks: tuple[float, ...]) -> str:
+        """Teach the tracker, commission the rig, or cancel; return an empty text, or the reason of a refusal."""
+        if action == CANCEL:
+            if self._measurement is not None:
+                self._measurement.cancel()
+            return ""
+        if problem := self.at_work():
+            return problem
+        if action == TEACH and (self.graph.state()["bridge"] or {}).get("armed"):
+            return "the tracker starts anew, and the coils are armed; disarm first"
+        measurement = self._measurement = Measurement(action)
+        run = self._teach(measurement, marks) if action == TEACH else self._commission(measurement)
+        self._measuring = asyncio.create_task(_ended(measurement, run))
+        return ""
+
+    def picture(self) -> bytes:
+        """Return the picture of the last measurement, a PNG file; empty if there is none."""
+        path = self._measurement and self._measurement.picture
+        return path.read_bytes() if path and path.is_file() else b""
+
     async def watch(self) -> None:
         """Check what runs; called several times a second.
 
@@ -266,8 +302,42 @@ class RecordingHost(GraphHost):
             await self._end_recording()
 
     async def close(self) -> None:
-        """End the recording."""
+        """End measurement and recording."""
+        if self._measurement is not None and self._measuring is not None:
+            await self._measurement.close()
+            await self._measuring
         await self._end_recording()
+
+    async def _teach(self, measurement: Measurement, marks: tuple[float, ...]) -> str:
+        """Let the tracker learn the needle from what the camera shows now; return what went wrong."""
+        folder = new_name(self._recordings, f"{self.setup.name}_taught")
+        told = folder / "tracker.yaml"
+        measurement.picture = told.with_suffix(".png")
+        folder.mkdir(parents=True)
+        raw = self.graph.settings.image_transport == "raw"
+        camera = [topics.IMAGE if raw else topics.COMPRESSED_IMAGE, topics.CAMERA_INFO]
+        bag = BagRecording(folder / "frames", {"setup": self.setup.name}, self.graph, camera)
+        await bag.begin()
+        await asyncio.sleep(TAUGHT_TIME)
+        await bag.end()
+        tail, tip = ([f"{value:.2f}" for value in mark] for mark in (marks[:2], marks[2:]))
+        arguments = [str(bag.output), "--tail", *tail, "--tip", *tip, "--setup", str(self.setup.path)]
+        if not await measurement.run([*arguments, "--output", str(told)]):
+            return "not taught"
+        if not await restart(self._tracker, TRACKER, taught_values(told)):
+            await asyncio.sleep(0.2)  # s; for the reason, on /diagnostics
+            return f"{TRACKER}: {self.graph.nodes().get(TRACKER, {}).get('message', 'not active')}"
+        measurement.lines.append("the tracker that runs has these parameters until it ends")
+        return ""
+
+    async def _commission(self, measurement: Measurement) -> str:
+        """Let the rig measure itself; return what went wrong."""
+        folder = self._commissioned
+        if folder is None or (folder / SUMMARY_FILE).exists():
+            folder = self._commissioned = new_name(self._recordings, f"{self.setup.name}_commissioned")
+        space = self.graph.node.get_namespace().strip("/")
+        arguments = [str(self.setup.path), "--live", "--output", str(folder), "--namespace", space]
+        return "" if await measurement.run(arguments) else "not commissioned"
 
     async def _end_recording(self) -> str:
         """End the recording, if there is one; return the problem if it is not complete."""
@@ -282,6 +352,16 @@ class RecordingHost(GraphHost):
             self._recording = None
             self.log(f"the recording has ended: {problem}" if problem else f"recorded: {recording.output}")
         return problem
+
+
+async def _ended(measurement: Measurement, run: Coroutine[Any, Any, str]) -> None:
+    """Run a measurement to its end, and let its last line be what went wrong."""
+    try:
+        problem = await run
+    except (MagnetosutureError, OSError) as error:
+        problem = str(error)
+    measurement.lines += [problem] if problem else []
+    measurement.state = FAILED if problem else DONE
 
 
 class SimulatedHost(RecordingHost):
@@ -320,8 +400,8 @@ class SimulatedHost(RecordingHost):
 
     async def select_setup(self, setup: str) -> str:
         """Stop the nodes and start those of a setup; return the reason of a refusal."""
-        if self.busy:
-            return self.busy
+        if problem := self.at_work():
+            return problem
         if setup not in self._setups:
             return f"setup: got {setup!r}, expected one of {', '.join(self._setups)}"
         try:
@@ -399,7 +479,8 @@ class ReplayHost(RecordingHost):
         """Return what runs and what is possible now."""
         recording = self._source.bag.recording
         simulated = bool(recording.notes.get("simulated", ""))
-        return {**super().state(), "setup": str(recording.path), "can_record": False, "simulated": simulated}
+        cannot = {"can_record": False, "can_measure": False}
+        return {**super().state(), "setup": str(recording.path), **cannot, "simulated": simulated}
 
     def start(self) -> None:
         """Start the nodes, and play the bag once they are there."""
@@ -409,6 +490,10 @@ class ReplayHost(RecordingHost):
     async def set_recording(self, recording: bool, operator: str) -> str:
         """Refuse: another command records a replay."""
         return "what comes of a bag is recorded by `magnetosuture replay BAG --output DIR`"
+
+    async def measure(self, action: str, marks: tuple[float, ...]) -> str:
+        """Refuse: a rig that was recorded does nothing more."""
+        return "a bag is measured by `magnetosuture teach BAG` and `magnetosuture calibrate BAG`"
 
     async def watch(self) -> None:
         """Raise what ended the replay, as a node that has ended or a bag that cannot be played on."""

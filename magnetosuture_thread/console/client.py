@@ -62,6 +62,7 @@ FIELDS: dict[str, dict[str, Field]] = {
     "procedure": {"action": _one_of("plan", "resume", "pause", "abort"), "procedure": _TEXT, "hold_to_run": _SWITCH},
     "hold": {},
     "tip": {"position": (tuple, Quantity("", "m", multiple=2))},
+    "measure": {"action": _one_of("teach", "commission", "cancel"), "marks": (tuple, Quantity("", "px", multiple=4))},
 }
 
 
@@ -109,6 +110,8 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     if not isinstance(kind, str) or kind not in FIELDS:
         raise _refusal("type", kind, f"one of {', '.join(FIELDS)}")
     values = {name: _checked(name, fields.get(name), *field) for name, field in FIELDS[kind].items()}
+    if kind == "measure" and (len(values["marks"]) != 4) == (values["action"] == "teach"):
+        raise _refusal("marks", list(values["marks"]), "u, v of tail and tip to teach, else none")
     for name in values.keys() & {"direction", "position"}:
         if len(values[name]) != 2:
             raise _refusal(name, list(values[name]), "a list of two numbers")
@@ -240,7 +243,10 @@ class Host(Protocol):
     `state` returns
 
         {"mode": "simulated|graph|replay", "setup": str, "setups": [str], "can_pause": bool, "paused": bool,
-         "can_record": bool,
+         "can_record": bool, "can_measure": bool,
+         "measurement": {"name": "teach|commission", "state": "running|done|failed",   # the last one
+                         "lines": [str],   # the latest that it printed
+                         "picture": bool} | None,   # whether there is one
          "recording": str,   # the path, empty if nothing is recorded
          "busy": str,        # operation in progress, empty if none
          "simulated": bool}
@@ -262,6 +268,17 @@ class Host(Protocol):
             recording: whether to start.
             operator: who commands the page that has control, "an operator" or "a script"; noted in the recording.
         """
+
+    async def measure(self, action: str, marks: tuple[float, ...]) -> str:
+        """Begin a measurement, or cancel it; return an empty text, or the reason of a refusal.
+
+        Args:
+            action: "teach" the tracker how the needle looks, "commission" the rig, or "cancel".
+            marks: of the former the needle's tail and tip in the camera's frame, u, v, u, v [px]; else empty.
+        """
+
+    def picture(self) -> bytes:
+        """Return the picture of the last measurement, a PNG file; empty if there is none."""
 
 
 class Outbox:
@@ -345,6 +362,7 @@ class RequestHandler:
             "select_setup": host.select_setup,
             "pause": host.set_paused,
             "record": host.set_recording,
+            "measure": host.measure,
         }
 
     def start(self, client: int, message: ClientMessage, operator: str, reply: Reply) -> None:

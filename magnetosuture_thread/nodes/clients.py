@@ -19,6 +19,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.node import Node
@@ -51,7 +52,8 @@ ACTIONS: dict[str, tuple[Service, Any]] = {
 }
 """What switches the coil bridge: service and request."""
 FIND_TIMEOUT = 3.0  # s in which nodes have found each other, on a busy machine too
-CHANGE_STATE = "coil_bridge/change_state"
+CHANGE, SET = "change_state", "set_parameters_atomically"  # services of a node
+CHANGE_STATE = f"coil_bridge/{CHANGE}"
 
 
 class Participant(ExitStack):
@@ -243,6 +245,42 @@ class Services:
                 return answers[0]
         problem = f"{name} did not answer within {timeout:g} s"
         raise GraphError(problem if calls else f"no service {name} within {min(timeout, call_within):g} s")
+
+
+def services_to_restart(*nodes: str) -> dict[str, str]:
+    """Return the services that `restart` calls, and their types."""
+    kinds = {CHANGE: "lifecycle_msgs/srv/ChangeState", SET: "rcl_interfaces/srv/SetParametersAtomically"}
+    return {f"{node}/{name}": kind for node in nodes for name, kind in kinds.items()}
+
+
+async def restart(services: Services, node: str, values: Mapping[str, Any]) -> bool:
+    """Give a node other parameters by its lifecycle, as `ros2 lifecycle set` and `ros2 param set` do.
+
+    Args:
+        services: those of `services_to_restart` among them.
+        node: its name.
+        values: of its parameters.
+
+    Returns:
+        Whether it is active with them.
+
+    Raises:
+        GraphError: it does not answer, or refuses a parameter.
+    """
+
+    async def change(transition: int) -> bool:
+        return bool((await call(CHANGE, ChangeState.Request(transition=Transition(id=transition)))).success)
+
+    async def call(name: str, request: Any) -> Any:
+        return await services.call(f"{node}/{name}", request, retry_period=math.inf)
+
+    await change(Transition.TRANSITION_DEACTIVATE)
+    await change(Transition.TRANSITION_CLEANUP)
+    parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    answer = (await call(SET, SetParametersAtomically.Request(parameters=parameters))).result
+    if not answer.successful:
+        raise GraphError(f"{node}: {answer.reason}")
+    return await change(Transition.TRANSITION_CONFIGURE) and await change(Transition.TRANSITION_ACTIVATE)
 
 
 class CoilClient(Participant):

@@ -274,8 +274,8 @@ class GraphHost:
         can_pause = bool(self._pause_service())
         self.paused = self.paused and can_pause
         texts = {"mode": self.mode, "setup": "", "setups": [], "recording": "", "busy": ""}
-        possible = {"can_pause": can_pause, "paused": self.paused, "can_record": False}
-        return {**texts, **possible, "simulated": self.graph.is_active(RIG)}
+        possible = {"can_pause": can_pause, "paused": self.paused, "can_record": False, "can_measure": False}
+        return {**texts, **possible, "measurement": None, "simulated": self.graph.is_active(RIG)}
 
     async def select_setup(self, setup: str) -> str:
         """Refuse: this graph is not started from the page."""
@@ -293,6 +293,14 @@ class GraphHost:
     async def set_recording(self, recording: bool, operator: str) -> str:
         """Refuse: this node records no bags."""
         return "the node console writes no bags; `magnetosuture console --graph` does"
+
+    async def measure(self, action: str, marks: tuple[float, ...]) -> str:
+        """Refuse: this node knows no setup."""
+        return "the node console measures nothing; `magnetosuture console SETUP --graph` does"
+
+    def picture(self) -> bytes:
+        """Return no picture."""
+        return b""
 
     def _pause_service(self) -> str:
         """Return the service that pauses time; empty if there is none."""

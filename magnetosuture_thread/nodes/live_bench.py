@@ -19,8 +19,8 @@ from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.msg import CoilBridgeState
 from magnetosuture_msgs.srv import GivePulse
 from numpy.typing import NDArray
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.bags import reading
@@ -34,7 +34,17 @@ from magnetosuture_thread.coils.pulses import IS_OVER, STOOD_STILL
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.needle_arc import heading_angle
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import DISCOVERY_TIME, TIMEOUT, CoilClient, Inbox, Latest, Services
+from magnetosuture_thread.nodes.clients import (
+    CHANGE,
+    DISCOVERY_TIME,
+    TIMEOUT,
+    CoilClient,
+    Inbox,
+    Latest,
+    Services,
+    restart,
+    services_to_restart,
+)
 from magnetosuture_thread.nodes.coil_bridge import PROCESS
 from magnetosuture_thread.nodes.node import read_report
 from magnetosuture_thread.rig.setups import Setup
@@ -47,12 +57,7 @@ from magnetosuture_thread.vision.lens import lens_of
 Vector = NDArray[np.float64]
 
 BRIDGE, TRACKER = "coil_bridge", "vision_tracker"
-CHANGE, SET, GET = "change_state", "set_parameters_atomically", "get_parameters"
-KINDS = {
-    CHANGE: "lifecycle_msgs/srv/ChangeState",
-    SET: "rcl_interfaces/srv/SetParametersAtomically",
-    GET: "rcl_interfaces/srv/GetParameters",
-}
+GET = "get_parameters"
 FRAMES = 24  # in which a needle's length is measured
 SAME_LENGTH = 1e-3  # of a needle, as a share; less is not worth another start of the nodes
 
@@ -83,7 +88,8 @@ class LiveBench(CoilClient):
         self._poses: list[tuple[float, Vector]] = []  # stamp and pose
         self._texts: dict[str, tuple[str, dict[str, str]]] = {}  # state of each node, and its values
         self._before: dict[str, dict[str, Any]] = {}  # parameters of nodes that were changed
-        kinds: dict[str, str] = {f"{node}/{name}": kind for node in (BRIDGE, TRACKER) for name, kind in KINDS.items()}
+        kinds = services_to_restart(BRIDGE, TRACKER)
+        kinds |= {f"{node}/{GET}": "rcl_interfaces/srv/GetParameters" for node in (BRIDGE, TRACKER)}
         self._calls = Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
         self._measured = Inbox(self.node, topics.NEEDLE_POSE, 1000)
         self._given = Inbox(self.node, topics.CURRENTS, 1000)
@@ -349,14 +355,11 @@ class LiveBench(CoilClient):
         self._set(node, values)
 
     def _set(self, node: str, values: Mapping[str, Any]) -> None:
-        for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
-            self._ask(f"{node}/{CHANGE}", ChangeState.Request(transition=Transition(id=transition)))
-        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-        answer = self._ask(f"{node}/{SET}", SetParametersAtomically.Request(parameters=parameters)).result
-        if not answer.successful:
-            raise GraphError(f"{node}: {answer.reason}")
-        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-            self._change(node, transition)
+        is_active = asyncio.run(restart(self._calls, node, values))
+        self._check()
+        if not is_active:
+            self._wait(0.2)  # for the reason, on /diagnostics
+            raise GraphError(f"{node}: {self._report(node)[0]}")
         if node == BRIDGE:
             self._await_driver()
 

@@ -156,7 +156,7 @@ class NodeProcesses:
         with (self._logs / f"{name}.log").open("wb") as log:
             streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
             # In a session of its own: Ctrl-C is ours to pass on.
-            options: dict[str, Any] = {"start_new_session": True, "preexec_fn": _end_with_parent}
+            options: dict[str, Any] = {"start_new_session": True, "preexec_fn": end_with_parent}
             self._processes[name] = subprocess.Popen(command, env=self._environment, **streams, **options)
 
     def kill(self, name: str) -> None:
@@ -183,8 +183,9 @@ class NodeProcesses:
         self._state.cleanup()
 
 
-def _end_with_parent() -> None:
-    """Ask Linux to interrupt this process when its parent dies."""
+def end_with_parent() -> None:
+    """Ask Linux to interrupt this process when its parent dies; what a shell runs in the background ignores that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
 
 

@@ -136,7 +136,8 @@ GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path")
 #: what the simulated thread exerts on the needle at its tail, in the frame of the dish
 GROUND_TRUTH_PULL = Channel("ground_truth/thread_pull", "geometry_msgs/msg/WrenchStamped")
 
-STARTS = ("arm", "reset", "resume")  # what a person presses that may let the needle move, and that must not come late
+# What a person presses that may let the needle move, and that must not come late.
+STARTS = ("arm", "reset", "resume", "commission")
 PRESS_TIMEOUT = 1.0  # s for which it counts: then the person has looked again
 
 EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs

@@ -201,7 +201,9 @@ class RecordingHost:
         self.shown: dict[str, Any] = {
             **{"mode": "simulated", "setup": "hernia_ring", "setups": ["hernia_ring", "petri_35mm_polyamide"]},
             **{"can_pause": True, "paused": False, "can_record": True, "recording": "", "busy": "", "simulated": True},
+            **{"can_measure": True, "measurement": None},
         }
+        self.shot = b""
 
     def state(self) -> dict[str, Any]:
         """Return what is shown now."""
@@ -227,3 +229,14 @@ class RecordingHost:
         self.requests.append(("record", recording))
         self.shown["recording"] = "output/console/take_1" if recording else ""
         return ""
+
+    async def measure(self, action: str, marks: tuple[float, ...]) -> str:
+        """Record a measurement; it runs until it is cancelled."""
+        self.requests.append((action, marks))
+        running = {"name": action, "state": "running", "lines": ["at rest: 2 µm"], "picture": False}
+        self.shown["measurement"] = {**self.shown["measurement"], "state": "failed"} if action == "cancel" else running
+        return ""
+
+    def picture(self) -> bytes:
+        """Return the picture that is shown."""
+        return self.shot

@@ -77,6 +77,11 @@ def test_jog_velocity_is_limited(direction: list[float], speed: float):
         ('{"type": "pause", "paused": 1}', "message.paused"),
         ('{"type": "select_setup", "setup": 7}', "message.setup"),
         ('{"type": "hello"}', "message.token"),
+        ('{"type": "measure", "action": "teach", "marks": []}', "message.marks"),
+        ('{"type": "measure", "action": "teach", "marks": [1, 2, 3]}', "message.marks"),
+        ('{"type": "measure", "action": "teach", "marks": [1, 2, 3, 4, 5, 6, 7, 8]}', "message.marks"),
+        ('{"type": "measure", "action": "cancel", "marks": [1, 2, 3, 4]}', "message.marks"),
+        ('{"type": "measure", "action": "commission", "marks": []}', "message.sent"),
         (json.dumps({"type": "end_jog", "ballast": "x" * 5000}), "4096"),
     ],
 )

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, ViewportSize, expect
 
@@ -75,11 +77,15 @@ class Operator:
 
     def tip(self) -> tuple[float, float]:
         """Return where the needle's tip is on the screen [px]."""
+        return self.at(TIP)
+
+    def at(self, point: tuple[float, float]) -> tuple[float, float]:
+        """Return where a point of the dish [m] is on the screen [px]."""
         dish = self.page.locator("#dish")
         box, scale = dish.bounding_box(), float(dish.get_attribute("data-scale") or 0)
         assert box is not None
         u, v = (float(entry) for entry in (dish.get_attribute("data-centre") or "").split(","))
-        return box["x"] + u + scale * TIP[0], box["y"] + v - scale * TIP[1]
+        return box["x"] + u + scale * point[0], box["y"] + v - scale * point[1]
 
     def last(self, velocity: tuple[float, float]) -> None:
         """Wait until this is the last command."""
@@ -133,6 +139,49 @@ def test_a_click_tells_which_end_of_the_needle_is_its_tip(operator: Operator):
     assert operator.served.graph.tips == [pytest.approx(TIP, abs=1e-4)]
     expect(dish).to_have_attribute("data-axis", "no")
     assert operator.served.graph.commands == []
+
+
+def test_the_needle_is_taught_by_a_click_on_each_of_its_ends(operator: Operator):
+    graph, host, page = operator.served.graph, operator.served.host, operator.page
+    graph.picture, graph.shown["bridge"]["armed"] = (1, picture()), False
+    expect(page.locator("#dish")).to_have_attribute("data-image", "yes")
+    expect(page.locator("#teach")).to_be_disabled()
+    operator.take_control()
+    page.click("#teach")
+    expect(page.locator("#marking")).to_have_text("Click on the needle's tail; Escape ends this")
+    page.keyboard.press("Escape")
+    expect(page.locator("#marking")).to_be_empty()
+    page.click("#teach")
+    page.mouse.click(*operator.at(TAIL))
+    expect(page.locator("#dish")).to_have_attribute("data-marks", "1")
+    expect(page.locator("#marking")).to_have_text("Click on the needle's tip; Escape ends this")
+    page.mouse.click(*operator.tip())
+    operator.until(lambda: host.requests)
+    # By the view of the frame: 80 µm a pixel, the dish's middle at 322, 238.
+    assert host.requests == [("teach", pytest.approx((347.0, 113.0, 434.5, 113.0), abs=2.0))]
+    expect(page.locator("#measurement")).to_have_text("teach: running")
+    expect(page.locator("#measured")).to_have_text("at rest: 2 µm")
+    for button in ("#teach", "#commission"):
+        expect(page.locator(button)).to_be_disabled()
+    host.shot = cv2.imencode(".png", np.zeros((30, 90, 3), np.uint8))[1].tobytes()
+    host.shown["measurement"].update(state="done", picture=True)
+    operator.until(lambda: page.evaluate("document.querySelector('#learnt img').naturalWidth") == 90)
+    expect(page.locator("#measurement")).to_have_attribute("data-level", "ok")
+    assert graph.commands == []
+    assert graph.tips == []
+
+
+def test_a_rig_commissions_itself_and_is_cancelled_by_the_page(operator: Operator):
+    host, page = operator.served.host, operator.page
+    expect(page.locator("#commission")).to_be_disabled()
+    operator.take_control()
+    page.click("#commission")
+    expect(page.locator("#measurement")).to_have_text("commission: running")
+    page.click("#cancel-measurement")
+    expect(page.locator("#measurement")).to_have_text("commission: failed")
+    assert host.requests == [("commission", ()), ("cancel", ())]
+    host.shown["can_measure"] = False
+    expect(page.locator("#measure-card")).to_be_hidden()
 
 
 KEYS = [

@@ -1,6 +1,6 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
-// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-axis (of a needle whose tip is unknown), data-ruler (what it measures), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-axis (of a needle whose tip is unknown), data-ruler (what it measures), data-marks (ends of the needle that were clicked on), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import {
   AHEAD, ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, forecastOf, nodeLook, onGround, tensionColour, threadLook, threadOf,
@@ -34,7 +34,7 @@ export class Dish {
     return needleArc(graph.needle, graph.needle_length, graph.needle_curvature).map((point) => this.placement.at(point));
   }
 
-  draw(graph, { since, drag, maxSpeed, showTension, ruler }) {
+  draw(graph, { since, drag, maxSpeed, showTension, ruler, marks }) {
     const { canvas, context } = this;
     const ratio = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -77,10 +77,11 @@ export class Dish {
     if (drag) this.#drawDrag(drag);
     this.#drawScaleBar(width, height);
     if (ruler.ends) this.#drawRuler(ruler);
+    this.#drawMarks(marks);
     Object.assign(canvas.dataset, {
       friction: look.state, colour: look.colour, estimate, tension: tension ? "shown" : "not",
       disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
-      plan: String(plan.length), ruler: ruler.text, axis: axis ? "yes" : "no", ghosts: String(ghosts.length),
+      plan: String(plan.length), ruler: ruler.text, marks: String(marks.length), axis: axis ? "yes" : "no", ghosts: String(ghosts.length),
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }
@@ -158,6 +159,23 @@ export class Dish {
     context.fillStyle = ESTIMATED;
     context.fill();
     context.globalAlpha = 1;
+  }
+
+  // The ends of the needle that were clicked on.
+  #drawMarks(marks) {
+    for (const { at } of marks) {
+      const [x, y] = this.placement.at(at);
+      for (const [width, colour] of [[5, this.halo], [2, this.velocity]]) {
+        this.context.beginPath();
+        for (const [right, down] of [[9, 0], [0, 9]]) {
+          this.context.moveTo(x - right, y - down);
+          this.context.lineTo(x + right, y + down);
+        }
+        this.context.lineWidth = width;
+        this.context.strokeStyle = colour;
+        this.context.stroke();
+      }
+    }
   }
 
   // Where the middle of the needle is to go.

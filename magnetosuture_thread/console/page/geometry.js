@@ -21,6 +21,13 @@ export class Placement {
     const [u, v] = centre;
     return [a, b, -b, a, this.centre[0] - a * u + b * v, this.centre[1] - b * u - a * v];
   }
+
+  // The pixel of a camera image that is shown at a point of the canvas.
+  pixel(view, [x, y]) {
+    const [a, b, , , left, top] = this.image(view);
+    const [right, down] = [(x - left) / (a * a + b * b), (y - top) / (a * a + b * b)];
+    return [a * right + b * down, a * down - b * right];
+  }
 }
 
 // Points along a needle's arc from tail to tip, and the tip's place.

@@ -3,6 +3,7 @@
 import { Connection, SILENCE_TIMEOUT } from "./connection.js";
 import { Dish } from "./dish.js";
 import { Input } from "./input.js";
+import { MeasurementCard } from "./measurement.js";
 import { showPanel } from "./panel.js";
 import { Plots } from "./plots.js";
 import { ProcedureBar } from "./procedure.js";
@@ -33,11 +34,18 @@ const state = {
 const dish = new Dish(find("dish"));
 const plots = new Plots(document);
 const input = new Input(find("dish"), find("directions"), {
-  changed: () => sendJog(), stop: () => emergencyStop(), needle: () => (ruler.on ? null : dish.needlePoints(state.graph)),
+  changed: () => sendJog(), stop: () => emergencyStop(), needle: () => (ruler.on || measurement.marks ? null : dish.needlePoints(state.graph)),
 });
 const ruler = new Ruler(find("dish"), drawSoon, () => dish.placement);
 const connection = new Connection({ opened, closed, received, frame });
 
+const measurement = new MeasurementCard(find("dish"), {
+  send: (message, at) => connection.send(message, at), changed: drawSoon,
+  place: (point) => {
+    const view = dish.image && state.graph?.tracker?.view;
+    return view ? { at: dish.placement.back(point), pixel: dish.placement.pixel(view, point) } : null;
+  },
+});
 const procedure = new ProcedureBar((message, at) => connection.send(message, at));
 
 const since = () => (state.graph ? clock() - state.received : 0);
@@ -177,7 +185,7 @@ find("ruler").addEventListener("click", ({ currentTarget }) => {
 });
 // Where nothing else tells which end of the needle is its tip, a click does.
 find("dish").addEventListener("click", ({ offsetX, offsetY }) => {
-  if (!hasControl() || ruler.on || !undirectedAxis(state.graph, since()) || !dish.placement) return;
+  if (!hasControl() || ruler.on || measurement.marks || !undirectedAxis(state.graph, since()) || !dish.placement) return;
   connection.send({ type: "tip", position: dish.placement.back([offsetX, offsetY]) });
 });
 function showLegend(shown) {
@@ -210,7 +218,7 @@ function drawSoon() {
 function draw() {
   scheduled = false;
   stats.drawn += 1;
-  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed, showTension: state.showTension, ruler });
+  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed, showTension: state.showTension, ruler, marks: measurement.marks ?? [] });
 }
 
 let counted = { at: clock(), drawn: 0 };
@@ -234,6 +242,7 @@ function update() {
   };
   showPanel(view);
   procedure.show(view);
+  measurement.show(view);
 }
 
 setInterval(() => {

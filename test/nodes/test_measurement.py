@@ -1,0 +1,117 @@
+"""What the operator's page measures, by the real commands: the host of a graph that runs, tracker and bridge in it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.commands.console import RecordingHost
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.clients import Participant
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+from magnetosuture_thread.nodes.console import ConsoleGraph
+from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+from magnetosuture_thread.rig.setups import read_setup
+from test.nodes import bridge
+from test.nodes.test_vision_tracker import TAIL, compressed, frame
+
+pytestmark = pytest.mark.slow
+
+WAIT = 120.0  # s; a command imports most of the package, and a busy machine takes its time
+HEADING, LENGTH = 0.4, 7e-3  # rad and m; of the needle in `frame`
+
+
+@pytest.fixture
+def host(graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RecordingHost]:
+    """Return the host of the graph of the test, whose commands are on the graph's domain."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    with Participant("console", domain=graph.domain) as page:
+        yield RecordingHost(
+            ConsoleGraph(page.node, ConsoleSettings()), read_setup("petri_35mm_polyamide"), tmp_path, print
+        )
+
+
+async def ended(host: RecordingHost, meanwhile: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """Wait for the end of a measurement, and return what the page shows of it."""
+    deadline = time.monotonic() + WAIT
+    while (shown := host.state()["measurement"])["state"] == "running":
+        assert time.monotonic() < deadline, shown
+        meanwhile()
+        host.graph.spin()
+        await asyncio.sleep(0.03)
+    await host.close()
+    return dict(shown)
+
+
+def test_a_needle_is_taught_by_its_marked_ends_and_the_tracker_goes_on_with_what_was_learnt(
+    graph: Any, host: RecordingHost, camera: Any, thread_arc: Any, tmp_path: Path
+):
+    tracker = graph.add(VisionTrackerNode, scene="dish_35mm", needle_length=6e-3)  # of which nobody knows better
+    poses, image = graph.listen(topics.NEEDLE_POSE), frame(camera, thread_arc)
+    tip = TAIL + LENGTH * np.array([np.cos(HEADING), np.sin(HEADING)])
+    marks = camera.view.to_pixels(np.array([TAIL, tip])).ravel().tolist()
+
+    def show() -> None:
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
+
+    async def teach() -> dict[str, Any]:
+        assert await host.measure("teach", tuple(marks)) == ""
+        assert await host.measure("commission", ()) == "teach is running; cancel it first"
+        return await ended(host, show)
+
+    shown = asyncio.run(teach())
+    assert shown["state"] == "done", shown["lines"]
+    assert shown["lines"][-1] == "the tracker that runs has these parameters until it ends"
+    assert host.picture().startswith(b"\x89PNG")
+    assert len(list(tmp_path.glob("*_petri_35mm_polyamide_taught/tracker.yaml"))) == 1
+    assert tracker.configured_settings.needle_length == pytest.approx(LENGTH, rel=0.02)
+    poses.clear()
+
+    def seen() -> bool:
+        show()
+        time.sleep(0.03)
+        return bool(poses)
+
+    graph.wait(seen, "a pose of the needle that was taught")
+
+
+def test_a_commissioning_that_the_bridge_refuses_says_the_way_out(graph: Any, host: RecordingHost):
+    graph.add(CoilBridgeNode, driver="simulated", scene="dish_35mm")
+
+    async def commission() -> dict[str, Any]:
+        assert await host.measure("commission", ()) == ""
+        return await ended(host)
+
+    shown = asyncio.run(commission())
+    assert shown["state"] == "failed"
+    assert any("start the bridge by -p coil_bridge:commissioning:=true" in line for line in shown["lines"])
+
+
+def test_a_measurement_ends_with_the_page_and_by_cancel(graph: Any, host: RecordingHost):
+    async def cancel() -> dict[str, Any]:
+        await host.measure("commission", ())
+        await asyncio.sleep(1.0)
+        assert await host.measure("cancel", ()) == ""
+        return await ended(host)
+
+    async def leave() -> None:
+        await host.measure("commission", ())
+        await asyncio.sleep(1.0)
+        await host.close()
+
+    assert asyncio.run(cancel())["lines"][-1] == "not commissioned"
+    asyncio.run(leave())
+    assert host.state()["measurement"]["state"] == "failed"
+
+
+def test_nothing_is_taught_while_the_coils_are_armed(graph: Any, host: RecordingHost):
+    bridge.armed(graph)
+    graph.wait(lambda: (host.graph.state()["bridge"] or {}).get("armed"), "an armed bridge")
+    assert "disarm first" in asyncio.run(host.measure("teach", (1.0, 2.0, 3.0, 4.0)))
