@@ -140,6 +140,7 @@ class Commissioning:
         seed: of the designed pulses.
         check_stops: called with the least currents that move the needle [A] and its speed [m/s] once they are
             known; returns why nothing more may be done.
+        check: called all the time while it computes, for some ten seconds at once; raises what interrupts.
     """
 
     def __init__(
@@ -150,11 +151,13 @@ class Commissioning:
         log: Callable[[str], None],
         seed: int = 0,
         check_stops: Callable[[Vector, float], Sequence[str]] = lambda currents, speed: (),
+        check: Callable[[], None] = lambda: None,
     ) -> None:
         self._bench, self._believed, self._radius, self._log = bench, believed, dish_radius, log
         self._random, self._length = np.random.default_rng([seed, 7]), bench.needle_length
         self._pulses: list[Pulse] = []
         self._most, self._check_stops = min(MOST_CURRENT, believed.max_current), check_stops
+        self._check = check
 
     def run(self) -> Commissioned:
         """Measure; see the module.
@@ -174,7 +177,9 @@ class Commissioning:
         dead = [coil for coil in coils if not answers[coil].moved]
         if dead:
             return Commissioned(tuple(answers), failures=(no_answer(dead, len(coils)),), pulses=tuple(self._pulses))
-        model = PulseModel(on_their_sides(self._guess(answers), self._pulses, deviations), deviations)
+        model = PulseModel(
+            on_their_sides(self._guess(answers), self._pulses, deviations, self._check), deviations, self._check
+        )
         model.fit(self._pulses)
         self._log(f"ladder: {len(self._pulses)} pulses, residual {math.sqrt(model.chi_square):.2f} deviations")
         top = max(answer.current for answer in answers)
@@ -400,7 +405,9 @@ class Commissioning:
         return [words for failed, words in checks if failed]
 
 
-def on_their_sides(rig: RigParameters, pulses: Sequence[Pulse], deviations: Vector) -> RigParameters:
+def on_their_sides(
+    rig: RigParameters, pulses: Sequence[Pulse], deviations: Vector, check: Callable[[], None] = lambda: None
+) -> RigParameters:
     """Return a guess with each coil on the side of the dish for which a fit is better.
 
     A needle that lies along a field moves towards the coil, one that lies against it away, and rests there until chance
@@ -410,11 +417,12 @@ def on_their_sides(rig: RigParameters, pulses: Sequence[Pulse], deviations: Vect
         rig: a guess.
         pulses: of the ladder.
         deviations: of a measured pose, shape (3,) [m, m, rad].
+        check: called all the time; raises what interrupts.
     """
     some = [replace(pulse, times=pulse.times[::THINNED], poses=pulse.poses[::THINNED]) for pulse in pulses]
 
     def error(guess: RigParameters) -> float:
-        model = PulseModel(guess, deviations)
+        model = PulseModel(guess, deviations, check)
         with suppress(ValueError, np.linalg.LinAlgError):  # from a wrong side a fit may lead nowhere
             model.fit(some, rounds=1)
             return model.chi_square

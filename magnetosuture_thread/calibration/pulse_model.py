@@ -216,6 +216,7 @@ class PulseModel:
     Args:
         guess: where the fit begins; its lengths, moment and mean field are what a ruler and the setup say.
         deviations: of a measured pose, shape (3,) [m, m, rad].
+        check: called all the time while it fits; raises what interrupts.
 
     Attributes:
         names: of the parameters in `interval` and `information`.
@@ -223,8 +224,8 @@ class PulseModel:
         chi_square: mean square of the residuals, in units of the deviations.
     """
 
-    def __init__(self, guess: RigParameters, deviations: Vector) -> None:
-        self._guess, self._sigma, count = guess, deviations, len(guess.angles)
+    def __init__(self, guess: RigParameters, deviations: Vector, check: Callable[[], None] = lambda: None) -> None:
+        self._guess, self._sigma, count, self._check = guess, deviations, len(guess.angles), check
         self._signs, self._field = np.sign(guess.fields), math.exp(np.log(np.abs(guess.fields)).mean())
         of_each, shared = [*KINDS][:2], [*KINDS][2:]
         self.names = [f"{kind} {k}" for kind in of_each for k in range(count)] + shared
@@ -291,6 +292,7 @@ class PulseModel:
 
     def _residuals(self, pulses: Sequence[Pulse], bases: Sequence[Vector], weak: Vector, p: Vector) -> Vector:
         """Return what is left of all pulses, and of what was known before, in deviations."""
+        self._check()
         rig, blocks = self._at(p), []
         for pulse, start, basis in zip(pulses, self._starts, bases, strict=True):
             block = (difference(rig.poses(pulse, start), pulse.poses) / self._sigma).ravel()

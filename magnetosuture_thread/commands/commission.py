@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -83,13 +83,13 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
     notes["rig"] = "a rig that runs" if options.live else poses
     if not options.live:
         notes["simulated"] = f"the rig {options.rig or 'of the setup'}, {poses}"
-    with _bench(setup, options) as (driven_bench, is_live):
+    with _bench(setup, options) as (driven_bench, is_live, check):
         how: dict[str, Any] = {"simulated": not is_live, "poses": notes["rig"], "rig": options.rig or setup.name}
         stops = folder / STOPS_FILE
         bench = RecordedBench(driven_bench, folder / PULSES, notes)
         first = {"check_stops": partial(checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
         radius = setup.scene.dish.radius
-        result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, **first).run()
+        result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check, **first).run()
         result = verify_square(result, setup, bench)
     if bench.reused:
         terminal.log(f"{bench.reused} pulses were there from a run before")
@@ -116,22 +116,23 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
 
 
 @contextmanager
-def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, bool]]:
-    """Yield the bench of the options, and whether it is a rig that runs."""
+def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, bool, Callable[[], None]]]:
+    """Yield the bench of the options, whether it is a rig that runs, and what raises an interruption that is kept."""
     if not options.live:
-        yield SimulatedBench(with_rig(setup, options.rig), drawn=options.drawn_poses, seed=options.seed), False
+        bench = SimulatedBench(with_rig(setup, options.rig), drawn=options.drawn_poses, seed=options.seed)
+        yield bench, False, lambda: None
         return
     from magnetosuture_thread.nodes.live_bench import LiveBench  # late, as it needs ROS
     from magnetosuture_thread.nodes.processes import Interruption
 
-    with Interruption() as interruption, LiveBench(setup, interruption.check, options.namespace) as bench:
-        yield bench, True
+    with Interruption() as interruption, LiveBench(setup, interruption.check, options.namespace) as live:
+        yield live, True, interruption.check
 
 
 def _check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     setup = read_setup(options.setup)
     rig = read_rig(options.output, setup.coils)
-    with _bench(setup, options) as (bench, _):
+    with _bench(setup, options) as (bench, _, _):
         commissioning = Commissioning(bench, setup.coils, setup.scene.dish.radius, terminal.log, options.seed)
         changed = commissioning.check(rig)
     for words in changed or ["the rig is still the one that was measured"]:

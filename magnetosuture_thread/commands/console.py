@@ -20,15 +20,14 @@ from typing import Any
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.calibration.commission_files import SUMMARY_FILE
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.commands.measurement import DONE, FAILED, RUNNING, Measurement, taught_values
+from magnetosuture_thread.commands.measurement import DONE, FAILED, RUNNING, TEACH, Measurement, taught_values
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.evaluation.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.evaluation.workers import Log
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Inbox, Participant, Services, restart, services_to_restart
+from magnetosuture_thread.nodes.clients import Inbox, Participant, Services, parameters_of, restart, services_to_restart
 from magnetosuture_thread.nodes.console import NAME, RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.processes import STOPS, NodeProcesses
 from magnetosuture_thread.rig.setups import Setup, read_setup
@@ -39,8 +38,8 @@ from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, S
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
 TRACKER = "vision_tracker"
-TEACH, COMMISSION, CANCEL = "teach", "commission", "cancel"
 TAUGHT_TIME = 1.0  # s of frames, in the first of which the needle is marked
+SAME_LENGTH = 0.02  # of a needle, as a share; marks are less certain than that
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
@@ -223,7 +222,7 @@ class RecordingHost(GraphHost):
         self._tracker = Services(graph.node, services_to_restart(TRACKER))
         self._measurement: Measurement | None = None
         self._measuring: asyncio.Task[None] | None = None
-        self._commissioned: Path | None = None  # the last commissioning, which goes on if it is not finished
+        self._cancelled: Path | None = None  # a commissioning that goes on
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
@@ -272,24 +271,24 @@ class RecordingHost(GraphHost):
         return ""
 
     async def measure(self, action: str, marks: tuple[float, ...]) -> str:
-        """Teach the tracker, commission the rig, or cancel; return an empty text, or the reason of a refusal."""
-        if action == CANCEL:
-            if self._measurement is not None:
-                self._measurement.cancel()
-            return ""
+        """Teach the tracker or commission the rig; return an empty text, or the reason of a refusal."""
         if problem := self.at_work():
             return problem
-        if action == TEACH and (self.graph.state()["bridge"] or {}).get("armed"):
-            return "the tracker starts anew, and the coils are armed; disarm first"
+        if self._is_armed():
+            return "the coils are armed; disarm first"
         measurement = self._measurement = Measurement(action)
         run = self._teach(measurement, marks) if action == TEACH else self._commission(measurement)
         self._measuring = asyncio.create_task(_ended(measurement, run))
         return ""
 
+    def cancel(self) -> None:
+        """End the measurement that runs, if there is one."""
+        if self._measurement is not None and self._measurement.state == RUNNING:
+            self._measurement.cancel()
+
     def picture(self) -> bytes:
         """Return the picture of the last measurement, a PNG file; empty if there is none."""
-        path = self._measurement and self._measurement.picture
-        return path.read_bytes() if path and path.is_file() else b""
+        return b"" if self._measurement is None else self._measurement.picture[1]
 
     async def watch(self) -> None:
         """Check what runs; called several times a second.
@@ -304,15 +303,18 @@ class RecordingHost(GraphHost):
     async def close(self) -> None:
         """End measurement and recording."""
         if self._measurement is not None and self._measuring is not None:
-            await self._measurement.close()
+            if await self._measurement.close():  # it had no time to disarm
+                await self.graph.execute_action("disarm")
             await self._measuring
         await self._end_recording()
+
+    def _is_armed(self) -> bool:
+        return bool((self.graph.state()["bridge"] or {}).get("armed"))
 
     async def _teach(self, measurement: Measurement, marks: tuple[float, ...]) -> str:
         """Let the tracker learn the needle from what the camera shows now; return what went wrong."""
         folder = new_name(self._recordings, f"{self.setup.name}_taught")
         told = folder / "tracker.yaml"
-        measurement.picture = told.with_suffix(".png")
         folder.mkdir(parents=True)
         raw = self.graph.settings.image_transport == "raw"
         camera = [topics.IMAGE if raw else topics.COMPRESSED_IMAGE, topics.CAMERA_INFO]
@@ -322,22 +324,40 @@ class RecordingHost(GraphHost):
         await bag.end()
         tail, tip = ([f"{value:.2f}" for value in mark] for mark in (marks[:2], marks[2:]))
         arguments = [str(bag.output), "--tail", *tail, "--tip", *tip, "--setup", str(self.setup.path)]
-        if not await measurement.run([*arguments, "--output", str(told)]):
-            return "not taught"
-        if not await restart(self._tracker, TRACKER, taught_values(told)):
-            await asyncio.sleep(0.2)  # s; for the reason, on /diagnostics
-            return f"{TRACKER}: {self.graph.nodes().get(TRACKER, {}).get('message', 'not active')}"
+        is_taught = await measurement.run([*arguments, "--output", str(told)])
+        if (picture := told.with_suffix(".png")).is_file():
+            measurement.picture = folder.name, picture.read_bytes()
+        if not is_taught or measurement.cancelled or self._is_armed():
+            return "not given to the tracker: the coils are armed" if is_taught and self._is_armed() else "not taught"
+        values, setup = taught_values(told), self.setup.vision.needle_length
+        if problem := await self._change_tracker(values):
+            return problem
         measurement.lines.append("the tracker that runs has these parameters until it ends")
+        if abs(values["needle_length"] / setup - 1.0) > SAME_LENGTH:
+            measurement.lines.append(f"the setup's needle is {1e3 * setup:.2f} mm long: copy these parameters into it")
         return ""
 
+    async def _change_tracker(self, values: Mapping[str, Any]) -> str:
+        """Give the tracker other parameters, or leave it as it was; return what went wrong."""
+        before = await parameters_of(self._tracker, TRACKER, values)
+        try:
+            if await restart(self._tracker, TRACKER, values):
+                return ""
+            await asyncio.sleep(0.2)  # s; for the reason, on /diagnostics
+            problem = f"{TRACKER}: {self.graph.nodes().get(TRACKER, {}).get('message', 'not active')}"
+        except GraphError as error:
+            problem = str(error)
+        await restart(self._tracker, TRACKER, before)
+        return problem
+
     async def _commission(self, measurement: Measurement) -> str:
-        """Let the rig measure itself; return what went wrong."""
-        folder = self._commissioned
-        if folder is None or (folder / SUMMARY_FILE).exists():
-            folder = self._commissioned = new_name(self._recordings, f"{self.setup.name}_commissioned")
+        """Let the rig measure itself; return what went wrong. One that was cancelled goes on."""
+        folder = self._cancelled or new_name(self._recordings, f"{self.setup.name}_commissioned")
         space = self.graph.node.get_namespace().strip("/")
         arguments = [str(self.setup.path), "--live", "--output", str(folder), "--namespace", space]
-        return "" if await measurement.run(arguments) else "not commissioned"
+        is_done = await measurement.run(arguments)
+        self._cancelled = folder if measurement.cancelled and folder.exists() else None
+        return "" if is_done else "not commissioned"
 
     async def _end_recording(self) -> str:
         """End the recording, if there is one; return the problem if it is not complete."""
@@ -358,8 +378,8 @@ async def _ended(measurement: Measurement, run: Coroutine[Any, Any, str]) -> Non
     """Run a measurement to its end, and let its last line be what went wrong."""
     try:
         problem = await run
-    except (MagnetosutureError, OSError) as error:
-        problem = str(error)
+    except Exception as error:  # whatever it is, the page goes on
+        problem = str(error) if isinstance(error, (MagnetosutureError, OSError)) else f"internal error: {error!r}"
     measurement.lines += [problem] if problem else []
     measurement.state = FAILED if problem else DONE
 

@@ -16,11 +16,16 @@ from typing import Any
 import yaml
 
 from magnetosuture_thread.nodes.processes import end_with_parent
+from magnetosuture_thread.settings.configuration import to_mapping
+from magnetosuture_thread.settings.errors import shortened
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
+from magnetosuture_thread.vision.calibration import LEARNT
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-MAX_LINES, MAX_CHARS = 40, 400  # that a page is sent
+TEACH, COMMISSION = "teach", "commission"
 RUNNING, DONE, FAILED = "running", "done", "failed"
-END_TIMEOUT = 10.0  # s for a command to give zero currents and disarm, once it is cancelled
+MAX_LINES, MAX_CHARS = 40, 400  # that a page is sent
+END_TIMEOUT = 10.0  # s for a command to end by itself, once it is cancelled
 
 
 class Measurement:
@@ -33,15 +38,15 @@ class Measurement:
         name: as given.
         lines: the latest that it has printed.
         state: `RUNNING`, `DONE` or `FAILED`.
-        picture: file that it writes besides; None for none.
+        picture: name and bytes of a PNG file that came of it; empty without one.
+        cancelled: whether it is to end.
     """
 
     def __init__(self, name: str) -> None:
-        self.name, self.state = name, RUNNING
-        self.picture: Path | None = None
+        self.name, self.state, self.cancelled = name, RUNNING, False
+        self.picture = ("", b"")
         self.lines: deque[str] = deque(maxlen=MAX_LINES)
         self._process: asyncio.subprocess.Process | None = None
-        self._cancelled = False
 
     async def run(self, arguments: Sequence[str]) -> bool:
         """Run the command to its end; return whether it succeeded.
@@ -49,48 +54,55 @@ class Measurement:
         Args:
             arguments: of the command.
         """
-        if self._cancelled:
-            return False
         # In a session of its own: Ctrl-C is ours to pass on.
-        options: dict[str, Any] = {"start_new_session": True, "preexec_fn": end_with_parent}
+        options: dict[str, Any] = {"start_new_session": True, "preexec_fn": end_with_parent, "limit": 1 << 20}
         streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         environment = {**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "100"}
         command = ("-m", "magnetosuture_thread.cli", self.name, *arguments)
         process = await asyncio.create_subprocess_exec(sys.executable, *command, env=environment, **streams, **options)
         self._process = process
+        if self.cancelled:  # while it began
+            self._interrupt()
         assert process.stdout is not None
         async for line in process.stdout:
-            if text := line.decode(errors="replace").rstrip():
-                self.lines.append(text[:MAX_CHARS])
+            if text := line.decode(errors="replace").strip():
+                self.lines.append(shortened(text, MAX_CHARS))
         return await process.wait() == 0
 
     def cancel(self) -> None:
-        """Interrupt the command, as Ctrl-C does."""
-        self._cancelled = True
+        """Interrupt the command, as Ctrl-C does; once, as it then leaves the nodes as they were."""
+        if not self.cancelled:
+            self.cancelled = True
+            self._interrupt()
+
+    async def close(self) -> bool:
+        """Cancel the command, and wait for its end; return whether it had to be killed."""
+        self.cancel()
+        if self._process is None:
+            return False
+        try:
+            await asyncio.wait_for(self._process.wait(), END_TIMEOUT)
+        except asyncio.TimeoutError:
+            self._process.kill()
+            return True
+        return False
+
+    def shown(self) -> dict[str, Any]:
+        """Return what a page shows of it; see `console.client.Host`."""
+        return {"name": self.name, "state": self.state, "lines": list(self.lines), "picture": self.picture[0]}
+
+    def _interrupt(self) -> None:
         if self._process is not None and self._process.returncode is None:
             with suppress(ProcessLookupError):  # it has ended by itself just now
                 self._process.send_signal(signal.SIGINT)
 
-    async def close(self) -> None:
-        """Cancel the command, and wait for its end."""
-        self.cancel()
-        if self._process is not None:
-            try:
-                await asyncio.wait_for(self._process.wait(), END_TIMEOUT)
-            except asyncio.TimeoutError:
-                self._process.kill()
-
-    def shown(self) -> dict[str, Any]:
-        """Return what a page shows of it; see `console.client.Host`."""
-        has_picture = self.picture is not None and self.picture.is_file()
-        return {"name": self.name, "state": self.state, "lines": list(self.lines), "picture": has_picture}
-
 
 def taught_values(path: Path) -> dict[str, Any]:
-    """Return the parameters that `teach` has written for the tracker.
+    """Return the parameters that `teach` has written for the tracker, with those that it leaves out as usual.
 
     Raises:
         OSError: the file cannot be read.
     """
-    sections = yaml.safe_load(read_regular(path, MAX_TEXT_BYTES))
-    return {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
+    usual, sections = to_mapping(VisionTrackerSettings()), yaml.safe_load(read_regular(path, MAX_TEXT_BYTES))
+    values = {name: usual[name] for name in (*LEARNT, "straightening")}
+    return values | {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}

@@ -27,7 +27,7 @@ MAX_WATCHER_RATE = 20  # per second, besides receipts; beyond, a page without th
 MAX_PENDING_REQUESTS = 4  # of one page, besides those of `UNLEASED`
 MAX_UNACKNOWLEDGED = 2  # states in flight, and frames
 # Allowed for every page with the token, with or without control.
-UNLEASED = ("stop", "disarm", "pause procedure", "abort procedure")
+UNLEASED = ("stop", "disarm", "cancel", "pause procedure", "abort procedure")
 HELD = ("jog", "hold")  # messages that are repeated while something is held
 
 Message = str | bytes
@@ -85,7 +85,7 @@ class ClientMessage:
         """Name under which the answer is reported."""
         if self.type == "procedure":
             return f"{self.values['action']} procedure"
-        return str(self.values["action"]) if self.type == "bridge_action" else self.type
+        return str(self.values["action"]) if self.type in ("bridge_action", "measure") else self.type
 
     @property
     def starts(self) -> bool:
@@ -246,7 +246,7 @@ class Host(Protocol):
          "can_record": bool, "can_measure": bool,
          "measurement": {"name": "teach|commission", "state": "running|done|failed",   # the last one
                          "lines": [str],   # the latest that it printed
-                         "picture": bool} | None,   # whether there is one
+                         "picture": str} | None,   # its name, empty without one
          "recording": str,   # the path, empty if nothing is recorded
          "busy": str,        # operation in progress, empty if none
          "simulated": bool}
@@ -270,12 +270,15 @@ class Host(Protocol):
         """
 
     async def measure(self, action: str, marks: tuple[float, ...]) -> str:
-        """Begin a measurement, or cancel it; return an empty text, or the reason of a refusal.
+        """Begin a measurement; return an empty text, or the reason of a refusal.
 
         Args:
-            action: "teach" the tracker how the needle looks, "commission" the rig, or "cancel".
+            action: "teach" the tracker how the needle looks, or "commission" the rig.
             marks: of the former the needle's tail and tip in the camera's frame, u, v, u, v [px]; else empty.
         """
+
+    def cancel(self) -> None:
+        """End the measurement that runs, if there is one."""
 
     def picture(self) -> bytes:
         """Return the picture of the last measurement, a PNG file; empty if there is none."""
@@ -353,16 +356,16 @@ class RequestHandler:
     """
 
     def __init__(self, graph: Graph, host: Host, jog: JogController) -> None:
-        self.jog, self.hold = jog, graph.publish_hold
+        self.jog, self.hold, self._graph, self._host = jog, graph.publish_hold, graph, host
         self._pending: dict[asyncio.Task[None], int] = {}
         self._calls: dict[str, Callable[..., Awaitable[str]]] = {  # with the fields of the message
-            "bridge_action": graph.execute_action,
+            "bridge_action": self._switch,
             "tip": graph.point_at_tip,
             "procedure": graph.execute_procedure,
             "select_setup": host.select_setup,
             "pause": host.set_paused,
             "record": host.set_recording,
-            "measure": host.measure,
+            "measure": self._measure,
         }
 
     def start(self, client: int, message: ClientMessage, operator: str, reply: Reply) -> None:
@@ -393,6 +396,15 @@ class RequestHandler:
         for task in (tasks := list(self._pending)):
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _switch(self, action: str) -> str:
+        """Switch the bridge; what stops or disarms it ends a measurement, which would arm it again."""
+        if action in ("stop", "disarm"):
+            self._host.cancel()
+        return await self._graph.execute_action(action)
+
+    async def _measure(self, action: str, marks: tuple[float, ...]) -> str:
+        return await (self._switch("disarm") if action == "cancel" else self._host.measure(action, marks))
 
     async def _execute(self, message: ClientMessage, operator: str, reply: Reply) -> None:
         try:

@@ -10,7 +10,7 @@ import asyncio
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
@@ -19,11 +19,11 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
-from rcl_interfaces.srv import SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -52,7 +52,7 @@ ACTIONS: dict[str, tuple[Service, Any]] = {
 }
 """What switches the coil bridge: service and request."""
 FIND_TIMEOUT = 3.0  # s in which nodes have found each other, on a busy machine too
-CHANGE, SET = "change_state", "set_parameters_atomically"  # services of a node
+CHANGE, SET, GET = "change_state", "set_parameters_atomically", "get_parameters"  # services of a node
 CHANGE_STATE = f"coil_bridge/{CHANGE}"
 
 
@@ -248,9 +248,29 @@ class Services:
 
 
 def services_to_restart(*nodes: str) -> dict[str, str]:
-    """Return the services that `restart` calls, and their types."""
-    kinds = {CHANGE: "lifecycle_msgs/srv/ChangeState", SET: "rcl_interfaces/srv/SetParametersAtomically"}
+    """Return the services that `parameters_of` and `restart` call, and their types."""
+    kinds = {
+        CHANGE: "lifecycle_msgs/srv/ChangeState",
+        SET: "rcl_interfaces/srv/SetParametersAtomically",
+        GET: "rcl_interfaces/srv/GetParameters",
+    }
     return {f"{node}/{name}": kind for node in nodes for name, kind in kinds.items()}
+
+
+async def parameters_of(services: Services, node: str, names: Iterable[str]) -> dict[str, Any]:
+    """Return values of a node's parameters, as `ros2 param get` does.
+
+    Args:
+        services: those of `services_to_restart` among them.
+        node: its name.
+        names: of the parameters.
+
+    Raises:
+        GraphError: it does not answer.
+    """
+    request = GetParameters.Request(names=list(names))
+    answer = await services.call(f"{node}/{GET}", request, retry_period=math.inf)
+    return dict(zip(request.names, map(parameter_value_to_python, answer.values), strict=True))
 
 
 async def restart(services: Services, node: str, values: Mapping[str, Any]) -> bool:

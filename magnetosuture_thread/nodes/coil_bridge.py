@@ -84,6 +84,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self.system.recall(stop_record(self))
         self.system.remember()
         kind = PulseBridge if settings.commissioning else CoilBridge
+        self.health.note(commissioning=settings.commissioning)
         bridge = kind(settings, self.system.latch, self._scene.load(settings.scene))
         driver = make_driver(settings, len(bridge.coils), self._send_to_rig, self._count_rigs)
         self.system.open(settings, bridge, driver)

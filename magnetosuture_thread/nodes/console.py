@@ -298,6 +298,9 @@ class GraphHost:
         """Refuse: this node knows no setup."""
         return "the node console measures nothing; `magnetosuture console SETUP --graph` does"
 
+    def cancel(self) -> None:
+        """Do nothing: nothing is measured."""
+
     def picture(self) -> bytes:
         """Return no picture."""
         return b""

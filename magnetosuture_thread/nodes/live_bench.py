@@ -19,8 +19,6 @@ from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.msg import CoilBridgeState
 from magnetosuture_msgs.srv import GivePulse
 from numpy.typing import NDArray
-from rcl_interfaces.srv import GetParameters
-from rclpy.parameter import parameter_value_to_python
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.bags import reading
@@ -42,6 +40,7 @@ from magnetosuture_thread.nodes.clients import (
     Inbox,
     Latest,
     Services,
+    parameters_of,
     restart,
     services_to_restart,
 )
@@ -57,7 +56,6 @@ from magnetosuture_thread.vision.lens import lens_of
 Vector = NDArray[np.float64]
 
 BRIDGE, TRACKER = "coil_bridge", "vision_tracker"
-GET = "get_parameters"
 FRAMES = 24  # in which a needle's length is measured
 SAME_LENGTH = 1e-3  # of a needle, as a share; less is not worth another start of the nodes
 
@@ -89,7 +87,6 @@ class LiveBench(CoilClient):
         self._texts: dict[str, tuple[str, dict[str, str]]] = {}  # state of each node, and its values
         self._before: dict[str, dict[str, Any]] = {}  # parameters of nodes that were changed
         kinds = services_to_restart(BRIDGE, TRACKER)
-        kinds |= {f"{node}/{GET}": "rcl_interfaces/srv/GetParameters" for node in (BRIDGE, TRACKER)}
         self._calls = Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
         self._measured = Inbox(self.node, topics.NEEDLE_POSE, 1000)
         self._given = Inbox(self.node, topics.CURRENTS, 1000)
@@ -345,8 +342,9 @@ class LiveBench(CoilClient):
         return answer
 
     def _parameters(self, node: str, *names: str) -> list[Any]:
-        answer = self._ask(f"{node}/{GET}", GetParameters.Request(names=names))
-        return [parameter_value_to_python(value) for value in answer.values]
+        values = asyncio.run(parameters_of(self._calls, node, names))
+        self._check()
+        return [*values.values()]
 
     def _restart(self, node: str, values: Mapping[str, Any]) -> None:
         """Give a node other parameters, by its lifecycle."""

@@ -184,7 +184,10 @@ class NodeProcesses:
 
 
 def end_with_parent() -> None:
-    """Ask Linux to interrupt this process when its parent dies; what a shell runs in the background ignores that."""
+    """Ask Linux to interrupt this process when its parent dies.
+
+    A shell lets what it runs in the background ignore SIGINT, and that is inherited; it is undone here.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
 

@@ -112,6 +112,25 @@ def test_a_coil_that_was_believed_on_the_other_side_by_a_needle_against_its_fiel
     np.testing.assert_array_equal(on_their_sides(rough, pulses, deviations).angles, rough.angles)
 
 
+def test_a_fit_ends_as_soon_as_something_interrupts_it():
+    truth, called = parameters(), list[None]()
+
+    def check() -> None:
+        called.append(None)
+        if len(called) == 3:
+            raise KeyboardInterrupt
+
+    given = pulse([0.5, 0.0, 0.0, 0.0])
+    pulses = [replace(given, poses=truth.poses(given, np.array([-0.003, 0.0, angle]))) for angle in (0.4, 1.2)]
+    deviations = np.array([5e-6, 5e-6, 2e-3])
+    with pytest.raises(KeyboardInterrupt):
+        PulseModel(truth, deviations, check).fit(pulses)
+    called.clear()
+    with pytest.raises(KeyboardInterrupt):
+        on_their_sides(truth, pulses, deviations, check)
+    assert len(called) == 3
+
+
 def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
     truth, random = parameters(), np.random.default_rng(5)
     deviations, pulses, pose = np.array([5e-6, 5e-6, 2e-3]), [], np.array([-0.003, 0.0, 0.4])

@@ -69,7 +69,7 @@ def state(friction: str = "free", count: int = 0) -> dict[str, Any]:
         "nodes": {
             "vision_tracker": {"level": "ok", "message": "needle tracked", "values": {}, "age": 0.4},
             "thread_model": {"level": "ok", "message": "predicting", "values": {}, "age": 0.3},
-            "coil_bridge": {"level": "ok", "message": "armed", "values": {}, "age": 0.5},
+            "coil_bridge": {"level": "ok", "message": "armed", "values": {"commissioning": "True"}, "age": 0.5},
         },
     }
 
@@ -233,9 +233,13 @@ class RecordingHost:
     async def measure(self, action: str, marks: tuple[float, ...]) -> str:
         """Record a measurement; it runs until it is cancelled."""
         self.requests.append((action, marks))
-        running = {"name": action, "state": "running", "lines": ["at rest: 2 µm"], "picture": False}
-        self.shown["measurement"] = {**self.shown["measurement"], "state": "failed"} if action == "cancel" else running
+        self.shown["measurement"] = {"name": action, "state": "running", "lines": ["at rest: 2 µm"], "picture": ""}
         return ""
+
+    def cancel(self) -> None:
+        """End the measurement."""
+        if self.shown["measurement"] is not None:
+            self.shown["measurement"]["state"] = "failed"
 
     def picture(self) -> bytes:
         """Return the picture that is shown."""

@@ -144,6 +144,7 @@ def test_a_click_tells_which_end_of_the_needle_is_its_tip(operator: Operator):
 def test_the_needle_is_taught_by_a_click_on_each_of_its_ends(operator: Operator):
     graph, host, page = operator.served.graph, operator.served.host, operator.page
     graph.picture, graph.shown["bridge"]["armed"] = (1, picture()), False
+    graph.shown.update(needle=None, axis=graph.shown["needle"])  # a click would tell the tip, but for the marks
     expect(page.locator("#dish")).to_have_attribute("data-image", "yes")
     expect(page.locator("#teach")).to_be_disabled()
     operator.take_control()
@@ -164,7 +165,7 @@ def test_the_needle_is_taught_by_a_click_on_each_of_its_ends(operator: Operator)
     for button in ("#teach", "#commission"):
         expect(page.locator(button)).to_be_disabled()
     host.shot = cv2.imencode(".png", np.zeros((30, 90, 3), np.uint8))[1].tobytes()
-    host.shown["measurement"].update(state="done", picture=True)
+    host.shown["measurement"].update(state="done", picture="taught")
     operator.until(lambda: page.evaluate("document.querySelector('#learnt img').naturalWidth") == 90)
     expect(page.locator("#measurement")).to_have_attribute("data-level", "ok")
     assert graph.commands == []
@@ -172,14 +173,20 @@ def test_the_needle_is_taught_by_a_click_on_each_of_its_ends(operator: Operator)
 
 
 def test_a_rig_commissions_itself_and_is_cancelled_by_the_page(operator: Operator):
-    host, page = operator.served.host, operator.page
-    expect(page.locator("#commission")).to_be_disabled()
+    graph, host, page = operator.served.graph, operator.served.host, operator.page
     operator.take_control()
-    page.click("#commission")
-    expect(page.locator("#measurement")).to_have_text("commission: running")
-    page.click("#cancel-measurement")
-    expect(page.locator("#measurement")).to_have_text("commission: failed")
-    assert host.requests == [("commission", ()), ("cancel", ())]
+    expect(page.locator("#commission")).to_be_disabled()  # as long as the bridge is armed
+    graph.shown["bridge"]["armed"] = False
+    for end in ("#cancel-measurement", "#disarm"):
+        page.click("#commission")
+        expect(page.locator("#measurement")).to_have_text("commission: running")
+        graph.shown["bridge"]["armed"] = True  # by the command
+        page.click(end)
+        expect(page.locator("#measurement")).to_have_text("commission: failed")
+        assert graph.actions.pop() == "disarm"
+    assert host.requests == 2 * [("commission", ())]
+    graph.shown["nodes"]["coil_bridge"]["values"] = {"commissioning": "False"}
+    expect(page.locator("#commission")).to_be_disabled()
     host.shown["can_measure"] = False
     expect(page.locator("#measure-card")).to_be_hidden()
 

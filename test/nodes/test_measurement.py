@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from magnetosuture_thread.commands import measurement
 from magnetosuture_thread.commands.console import RecordingHost
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.nodes import topics
@@ -94,21 +95,29 @@ def test_a_commissioning_that_the_bridge_refuses_says_the_way_out(graph: Any, ho
     assert any("start the bridge by -p coil_bridge:commissioning:=true" in line for line in shown["lines"])
 
 
-def test_a_measurement_ends_with_the_page_and_by_cancel(graph: Any, host: RecordingHost):
-    async def cancel() -> dict[str, Any]:
-        await host.measure("commission", ())
-        await asyncio.sleep(1.0)
-        assert await host.measure("cancel", ()) == ""
+def test_a_measurement_is_interrupted_by_cancel_and_with_the_page(
+    graph: Any, host: RecordingHost, monkeypatch: pytest.MonkeyPatch
+):
+    """No bridge is there: by itself the command would wait for one, and then say so."""
+    monkeypatch.setattr(measurement, "END_TIMEOUT", WAIT)
+
+    async def cancel(end: Callable[[], Any]) -> dict[str, Any]:
+        assert await host.measure("commission", ()) == ""
+        while host._measurement is None or host._measurement._process is None:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(1.0)  # while it imports what it needs, or waits for the bridge
+        await end()
         return await ended(host)
 
-    async def leave() -> None:
-        await host.measure("commission", ())
-        await asyncio.sleep(1.0)
-        await host.close()
+    async def press() -> None:
+        host.cancel()
+        host.cancel()  # a second time, which must not disturb its end
 
-    assert asyncio.run(cancel())["lines"][-1] == "not commissioned"
-    asyncio.run(leave())
-    assert host.state()["measurement"]["state"] == "failed"
+    for end in (press, host.close):
+        shown = asyncio.run(cancel(end))
+        assert shown["state"] == "failed"
+        assert shown["lines"][-1] == "not commissioned"
+        assert not any("no coil_bridge" in line for line in shown["lines"])
 
 
 def test_nothing_is_taught_while_the_coils_are_armed(graph: Any, host: RecordingHost):

@@ -2,6 +2,7 @@
 
 const LEVELS = { running: "rest", done: "ok", failed: "error" };
 const ENDS = ["tail", "tip"];
+const COMMISSION = "Coils, needle and delay, by pulses: a needle without a thread in an empty dish";
 const find = (id) => document.getElementById(id);
 
 export class MeasurementCard {
@@ -9,7 +10,6 @@ export class MeasurementCard {
   // camera's image [px], null while no image is shown; changed() is called when there is something else to draw.
   constructor(canvas, { send, place, changed }) {
     this.marks = null; // while ends are marked, those that are: as of place()
-    this.pictured = false;
     const mark = (marks) => {
       this.marks = marks;
       changed();
@@ -23,9 +23,11 @@ export class MeasurementCard {
     request("cancel-measurement", "cancel");
     find("teach").addEventListener("click", () => mark(this.marks ? null : []));
     addEventListener("keydown", ({ code }) => code === "Escape" && this.marks && mark(null));
-    canvas.addEventListener("click", ({ offsetX, offsetY, timeStamp }) => {
+    canvas.addEventListener("click", (event) => {
+      const { offsetX, offsetY, timeStamp } = event;
       const marked = this.marks && place([offsetX, offsetY]);
       if (!marked) return;
+      event.stopImmediatePropagation(); // it means nothing else
       mark([...this.marks, marked]);
       if (this.marks.length < ENDS.length) return;
       send({ type: "measure", action: "teach", marks: this.marks.flatMap(({ pixel }) => pixel) }, timeStamp);
@@ -33,17 +35,20 @@ export class MeasurementCard {
     });
   }
 
-  show({ graph, host, open, hasControl, hasImage }) {
+  show({ graph, host, open, hasControl, canCommand, hasImage }) {
     const measurement = host?.measurement;
     find("measure-card").hidden = !host?.can_measure;
     const running = measurement?.state === "running";
     const may = Boolean(open && hasControl && host && !host.busy);
-    if (!may || running) this.marks = null;
+    const rests = may && !running && !graph?.bridge?.armed;
     const teach = find("teach");
-    teach.disabled = !(may && !running && hasImage && graph?.tracker?.view && !graph.bridge?.armed);
+    teach.disabled = !(rests && hasImage && graph?.tracker?.view);
+    if (teach.disabled) this.marks = null;
     teach.setAttribute("aria-pressed", String(this.marks !== null));
-    find("commission").disabled = !may || running || this.marks !== null;
-    find("cancel-measurement").disabled = !may || !running;
+    const commissions = graph?.nodes?.coil_bridge?.values?.commissioning === "True";
+    find("commission").disabled = !rests || !commissions || this.marks !== null;
+    find("commission").title = commissions ? COMMISSION : "Where the bridge is started with commissioning: true";
+    find("cancel-measurement").disabled = !(open && canCommand && running);
     write("marking", this.marks ? `Click on the needle's ${ENDS[this.marks.length]}; Escape ends this` : "");
     const chip = find("measurement");
     chip.dataset.level = LEVELS[measurement?.state] ?? "silent";
@@ -53,10 +58,10 @@ export class MeasurementCard {
     const over = Boolean(graph?.bridge?.armed) && !running; // whoever steers needs the room
     lines.hidden = !text || over;
     if (write("measured", text)) lines.scrollTop = lines.scrollHeight;
-    const pictured = Boolean(measurement?.picture);
-    if (pictured && !this.pictured) find("learnt").firstElementChild.src = `measurement.png?${Date.now()}`;
-    find("learnt").hidden = !pictured || over;
-    this.pictured = pictured;
+    const picture = measurement?.picture ? `measurement.png?${measurement.picture}` : "";
+    const image = find("learnt").firstElementChild;
+    if (picture && image.getAttribute("src") !== picture) image.src = picture;
+    find("learnt").hidden = !picture || over;
   }
 }
 
