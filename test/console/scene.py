@@ -69,7 +69,7 @@ def state(friction: str = "free", count: int = 0) -> dict[str, Any]:
         "nodes": {
             "vision_tracker": {"level": "ok", "message": "needle tracked", "values": {}, "age": 0.4},
             "thread_model": {"level": "ok", "message": "predicting", "values": {}, "age": 0.3},
-            "coil_bridge": {"level": "ok", "message": "armed", "values": {"commissioning": "True"}, "age": 0.5},
+            "coil_bridge": {"level": "ok", "message": "armed", "values": {"commissioning": "False"}, "age": 0.5},
         },
     }
 

@@ -175,18 +175,23 @@ def test_the_needle_is_taught_by_a_click_on_each_of_its_ends(operator: Operator)
 def test_a_rig_commissions_itself_and_is_cancelled_by_the_page(operator: Operator):
     graph, host, page = operator.served.graph, operator.served.host, operator.page
     operator.take_control()
+    graph.shown["nodes"]["coil_bridge"]["values"] = {"commissioning": "True"}
+    expect(page.locator("#headline")).to_have_text("The coil bridge commissions: it follows no jog")
     expect(page.locator("#commission")).to_be_disabled()  # as long as the bridge is armed
     graph.shown["bridge"]["armed"] = False
     for end in ("#cancel-measurement", "#disarm"):
         page.click("#commission")
         expect(page.locator("#measurement")).to_have_text("commission: running")
+        expect(page.locator("#headline")).to_have_text("The rig commissions itself")
         graph.shown["bridge"]["armed"] = True  # by the command
         page.click(end)
         expect(page.locator("#measurement")).to_have_text("commission: failed")
         assert graph.actions.pop() == "disarm"
     assert host.requests == 2 * [("commission", ())]
+    expect(page.locator("#headline")).to_have_text("The coil bridge commissions: it follows no jog")
     graph.shown["nodes"]["coil_bridge"]["values"] = {"commissioning": "False"}
     expect(page.locator("#commission")).to_be_disabled()
+    expect(page.locator("#headline")).to_have_text("Disarmed: press Arm to enable commands")
     host.shown["can_measure"] = False
     expect(page.locator("#measure-card")).to_be_hidden()
 

@@ -17,6 +17,9 @@ export function motionStatus(view) {
   if (!graph) return result("silent", "No data from the server yet", []);
   if (since > SILENCE_TIMEOUT) return result("error", `No data from the server for ${seconds(since)}`, ["The drawing is old. The jog has ended."]);
   const bridge = graph.bridge;
+  const { name, state } = host?.measurement ?? {};
+  // It presses the emergency stop itself, and lets the bridge stand still.
+  if (name === "commission" && state === "running") return result("rest", "The rig commissions itself", ["Cancel, Disarm and the emergency stop end it."]);
   if (bridge?.emergency_stopped) return result("error", "Emergency stop is pressed", ["The bridge keeps all coils at zero. To resume: Reset, then Arm.", ...others(bridge, ["emergency stop"])]);
   if (host?.busy) return result("silent", capital(host.busy), ["Please wait."]);
   if (host?.paused) return result("rest", "Paused", []);
@@ -64,9 +67,11 @@ function perceptionStatus({ since, graph, host }) {
   return null;
 }
 
-function readiness({ graph: { bridge }, late }) {
+function readiness({ graph, late }) {
+  const { bridge } = graph;
   if (!bridge.driver_ready) return result("error", `Driver ${bridge.driver} is not ready`, others(bridge, []));
   if (late) return result("error", `Computer or network late: key presses come ${seconds(late)} late`, ["The needle rests until they come in time.", ...others(bridge, [])]);
+  if (graph.nodes?.coil_bridge?.values?.commissioning === "True") return result("rest", "The coil bridge commissions: it follows no jog", others(bridge, []));
   if (!bridge.armed) return result("rest", "Disarmed: press Arm to enable commands", others(bridge, ["disarmed"]));
   return null;
 }
