@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from magnetosuture_thread.geometry.compiled import compiled_inline, source_digest
 
 
@@ -45,6 +47,7 @@ print(double(21.0), compilations() > 0)
 """
 
 
+@pytest.mark.slow
 def test_code_of_before_is_not_run_and_nothing_has_to_be_writable(tmp_path: Path):
     """In the user's cache, as beside the file; and with no place for a cache at all."""
     script, cache = tmp_path / "kernel.py", tmp_path / "cache"

@@ -90,6 +90,7 @@ def test_nothing_moves_before_the_delay_is_over():
     assert np.abs(found[TIMES > 0.17] - found[0]).max(axis=1).min() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("current", "residual", "turned"), [(0.3, (4e-5, -6e-5), (1, 0, 1, 0)), (0.1, (-9e-5, 4e-5), (0, 0, 1, 0))]
 )
@@ -131,6 +132,7 @@ def test_a_fit_ends_as_soon_as_something_interrupts_it():
     assert len(called) == 3
 
 
+@pytest.mark.slow
 def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
     truth, random = parameters(), np.random.default_rng(5)
     deviations, pulses, pose = np.array([5e-6, 5e-6, 2e-3]), [], np.array([-0.003, 0.0, 0.4])

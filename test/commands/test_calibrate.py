@@ -66,6 +66,7 @@ def run(folder: Path, *arguments: str) -> int:
     return cli.main(["calibrate", *arguments, *workers, "--setup", str(folder / "lab.yaml")])
 
 
+@pytest.mark.slow
 def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Path, tmp_path: Path, capsys):
     copy_with_notes(folder / "two", folder / "doubtful", unverified="salvaged without checksums")
     texts = []

@@ -126,6 +126,7 @@ def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path, topic: str):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
     summary = replay_offline(pose_bag, tmp_path / "a")
     assert (summary.frames, summary.tracked, summary.predicted, summary.source) == (30, 30, 30, "poses")

@@ -18,6 +18,8 @@ from magnetosuture_thread.evaluation import hernia
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.rig.setups import read_setup
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 STEERING = EXAMPLES / "hernia_steering"
 

@@ -149,6 +149,7 @@ def test_slits_that_are_passed_in_the_same_direction_are_each_crossed_and_none_i
     assert clearance(path, scene, planner.needle) > KEEP_OUT - 5e-6
 
 
+@pytest.mark.slow
 def test_a_shape_that_is_hidden_behind_another_is_wrapped_and_one_is_not_from_inside_of_it():
     planner = NeedlePlanner(posts((0.006, 0.0, 0.002), (0.0, 0.0, 0.003)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
     goal = {"wrap": {"around": "post_0", "angle": 6.0}}

@@ -42,6 +42,7 @@ def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, 
     return predictor
 
 
+@pytest.mark.slow
 def test_space_is_refused_at_the_start_in_the_plane_and_works_in_a_workspace_of_three_dimensions():
     east = NeedlePose(0.0, np.zeros(3), np.eye(3)[0])
     with pytest.raises(InvalidInputError, match=r"expected shapes \(2,\); in space, with a Workspace of dimension=3"):

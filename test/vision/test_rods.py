@@ -81,6 +81,7 @@ def is_along(seen: Track, ends: np.ndarray, share: float = 0.06) -> bool:
     return bool(apart < 2.0 + share * math.dist(*ends))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounded", [False, True])
 @pytest.mark.parametrize(("gleam", "least"), [(0.0, 10), (40.0, 9), (90.0, 4)])
 def test_the_axis_is_found_and_a_point_near_the_tip_gives_its_direction(rounded: bool, gleam: float, least: int):

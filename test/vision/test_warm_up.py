@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 SWEEP = """
 import importlib, pkgutil
 import numpy as np
@@ -44,6 +46,7 @@ for number, name in enumerate(list(CLASSES)[::3]):
 """
 
 
+@pytest.mark.slow
 def test_no_frame_compiles_anything_after_the_warm_up():
     # In a process of its own, as the other tests have compiled what they need.
     done = subprocess.run([sys.executable, "-c", SWEEP], capture_output=True, text=True, timeout=600, check=False)

@@ -42,6 +42,7 @@ def pull_out(rig: RigDynamics, nodes: np.ndarray) -> list[np.ndarray]:
     return shapes
 
 
+@pytest.mark.slow
 def test_the_model_predicts_the_rigs_loop():
     """Both keep strands a diameter apart, by code of their own."""
     nodes = loop_behind(1.2e-3)
