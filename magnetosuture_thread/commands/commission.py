@@ -132,8 +132,9 @@ def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, boo
 def _check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     setup = read_setup(options.setup)
     rig = read_rig(options.output, setup.coils)
-    with _bench(setup, options) as (bench, _, _):
-        commissioning = Commissioning(bench, setup.coils, setup.scene.dish.radius, terminal.log, options.seed)
+    with _bench(setup, options) as (bench, _, check):
+        radius = setup.scene.dish.radius
+        commissioning = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check)
         changed = commissioning.check(rig)
     for words in changed or ["the rig is still the one that was measured"]:
         terminal.log(words)

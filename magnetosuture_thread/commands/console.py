@@ -20,6 +20,7 @@ from typing import Any
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.calibration.commission_files import SUMMARY_FILE
 from magnetosuture_thread.commands import command, live
 from magnetosuture_thread.commands.measurement import DONE, FAILED, RUNNING, TEACH, Measurement, taught_values
 from magnetosuture_thread.console.server import ConsoleServer
@@ -39,6 +40,7 @@ from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, S
 TOKEN = "MAGNETOSUTURE_TOKEN"
 TRACKER = "vision_tracker"
 TAUGHT_TIME = 1.0  # s of frames, in the first of which the needle is marked
+SAME_DISH = 1e-5  # m
 SAME_LENGTH = 0.02  # of a needle, as a share; marks are less certain than that
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
@@ -94,7 +96,7 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
             setup = read_setup(name)
             page = stack.enter_context(Participant(NAME, namespace=options.namespace))
             graph = ConsoleGraph(page.node, settings(setup))
-            host = RecordingHost(graph, setup, options.record, log)
+            host = RecordingHost(graph, setup, options.record, log, measures=bool(options.setup))
         else:
             source = None
             if options.replay is not None:
@@ -212,24 +214,26 @@ class RecordingHost(GraphHost):
         setup: with which.
         recordings: folder that gets a bag for each recording.
         log: called with a line for a person.
+        measures: whether the setup is that of the graph, so that it can be measured.
     """
 
-    def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, log: Log) -> None:
+    def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, log: Log, *, measures: bool = True) -> None:
         super().__init__(graph)
+        self._measures = measures
         self.setup, self.busy, self.log = setup, "", log
         self._recordings = recordings
         self._recording: BagRecording | None = None
-        self._tracker = Services(graph.node, services_to_restart(TRACKER))
+        self._tracker: Services | None = None  # to change its parameters
         self._measurement: Measurement | None = None
         self._measuring: asyncio.Task[None] | None = None
-        self._cancelled: Path | None = None  # a commissioning that goes on
+        self._commissioned: Path | None = None  # folder of the last commissioning
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""
         recording = "" if self._recording is None else str(self._recording.output)
         state = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
         measurement = self._measurement and self._measurement.shown()
-        return {**super().state(), **state, "can_measure": True, "measurement": measurement}
+        return {**super().state(), **state, "can_measure": self._measures, "measurement": measurement}
 
     def notes(self, operator: str) -> dict[str, str]:
         """Return the notes of a recording, which the page that has control began.
@@ -274,6 +278,13 @@ class RecordingHost(GraphHost):
         """Teach the tracker or commission the rig; return an empty text, or the reason of a refusal."""
         if problem := self.at_work():
             return problem
+        if not self._measures:
+            return "nobody said which setup this graph has: `magnetosuture console SETUP --graph`"
+        believed, scene = self.setup.scene.dish.diameter, self.graph.state()["scene"] or {}
+        if abs(scene.get("dish_diameter", believed) - believed) > SAME_DISH:
+            return (
+                f"the graph's dish of {1e3 * scene['dish_diameter']:g} mm is not the setup's of {1e3 * believed:g} mm"
+            )
         if self._is_armed():
             return "the coils are armed; disarm first"
         measurement = self._measurement = Measurement(action)
@@ -332,32 +343,38 @@ class RecordingHost(GraphHost):
         values, setup = taught_values(told), self.setup.vision.needle_length
         if problem := await self._change_tracker(values):
             return problem
-        measurement.lines.append("the tracker that runs has these parameters until it ends")
+        measurement.lines.append("the tracker that runs knows this needle until it ends; its view is as before")
         if abs(values["needle_length"] / setup - 1.0) > SAME_LENGTH:
             measurement.lines.append(f"the setup's needle is {1e3 * setup:.2f} mm long: copy these parameters into it")
         return ""
 
     async def _change_tracker(self, values: Mapping[str, Any]) -> str:
         """Give the tracker other parameters, or leave it as it was; return what went wrong."""
-        before = await parameters_of(self._tracker, TRACKER, values)
+        if self._tracker is None:  # not before, as security policies need not allow it
+            self._tracker = Services(self.graph.node, services_to_restart(TRACKER))
+        tracker, problem, is_back = self._tracker, "", False
+        before = await parameters_of(tracker, TRACKER, values)
         try:
-            if await restart(self._tracker, TRACKER, values):
+            if await restart(tracker, TRACKER, values):
                 return ""
             await asyncio.sleep(0.2)  # s; for the reason, on /diagnostics
             problem = f"{TRACKER}: {self.graph.nodes().get(TRACKER, {}).get('message', 'not active')}"
         except GraphError as error:
             problem = str(error)
-        await restart(self._tracker, TRACKER, before)
-        return problem
+        with suppress(GraphError):
+            is_back = await restart(tracker, TRACKER, before)
+        return problem if is_back else f"{problem}; {TRACKER} is off: activate it, or start it anew"
 
     async def _commission(self, measurement: Measurement) -> str:
-        """Let the rig measure itself; return what went wrong. One that was cancelled goes on."""
-        folder = self._cancelled or new_name(self._recordings, f"{self.setup.name}_commissioned")
+        """Let the rig measure itself, from where it has come to if it is not finished; return what went wrong."""
+        folder = self._commissioned
+        if folder is None or not folder.exists() or (folder / SUMMARY_FILE).exists():
+            folder = self._commissioned = new_name(self._recordings, f"{self.setup.name}_commissioned")
+        else:
+            measurement.lines.append(f"goes on in {folder}; a console that is started anew begins anew")
         space = self.graph.node.get_namespace().strip("/")
         arguments = [str(self.setup.path), "--live", "--output", str(folder), "--namespace", space]
-        is_done = await measurement.run(arguments)
-        self._cancelled = folder if measurement.cancelled and folder.exists() else None
-        return "" if is_done else "not commissioned"
+        return "" if await measurement.run(arguments) else "not commissioned"
 
     async def _end_recording(self) -> str:
         """End the recording, if there is one; return the problem if it is not complete."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import subprocess
 import sys
+import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,13 +21,21 @@ from magnetosuture_thread.nodes.processes import end_with_parent
 from magnetosuture_thread.settings.configuration import to_mapping
 from magnetosuture_thread.settings.errors import shortened
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
-from magnetosuture_thread.vision.calibration import LEARNT
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-TEACH, COMMISSION = "teach", "commission"
+TEACH = "teach"
+# Parameters of a tracker that runs which change. Its view stays, with the check that the dish is where it was.
+TAUGHT = (
+    "needle_length",
+    "needle_width",
+    "max_needle_brightness",
+    "needle_colour",
+    "needle_is_blunt",
+    "max_needle_bend",
+)
 RUNNING, DONE, FAILED = "running", "done", "failed"
 MAX_LINES, MAX_CHARS = 40, 400  # that a page is sent
-END_TIMEOUT = 10.0  # s for a command to end by itself, once it is cancelled
+END_TIMEOUT = 20.0  # s for a command to end by itself, once it is cancelled: it starts nodes anew as they were
 
 
 class Measurement:
@@ -45,6 +55,7 @@ class Measurement:
     def __init__(self, name: str) -> None:
         self.name, self.state, self.cancelled = name, RUNNING, False
         self.picture = ("", b"")
+        self._cancelled_at = math.inf  # monotonic [s]
         self.lines: deque[str] = deque(maxlen=MAX_LINES)
         self._process: asyncio.subprocess.Process | None = None
 
@@ -62,7 +73,7 @@ class Measurement:
         process = await asyncio.create_subprocess_exec(sys.executable, *command, env=environment, **streams, **options)
         self._process = process
         if self.cancelled:  # while it began
-            self._interrupt()
+            self._signal(signal.SIGINT)
         assert process.stdout is not None
         async for line in process.stdout:
             if text := line.decode(errors="replace").strip():
@@ -70,10 +81,12 @@ class Measurement:
         return await process.wait() == 0
 
     def cancel(self) -> None:
-        """Interrupt the command, as Ctrl-C does; once, as it then leaves the nodes as they were."""
+        """Interrupt the command, as Ctrl-C does; once more only if it does not end, and then for good."""
         if not self.cancelled:
-            self.cancelled = True
-            self._interrupt()
+            self.cancelled, self._cancelled_at = True, time.monotonic()
+            self._signal(signal.SIGINT)
+        elif time.monotonic() > self._cancelled_at + END_TIMEOUT:
+            self._signal(signal.SIGKILL)
 
     async def close(self) -> bool:
         """Cancel the command, and wait for its end; return whether it had to be killed."""
@@ -83,7 +96,7 @@ class Measurement:
         try:
             await asyncio.wait_for(self._process.wait(), END_TIMEOUT)
         except asyncio.TimeoutError:
-            self._process.kill()
+            self._signal(signal.SIGKILL)
             return True
         return False
 
@@ -91,18 +104,18 @@ class Measurement:
         """Return what a page shows of it; see `console.client.Host`."""
         return {"name": self.name, "state": self.state, "lines": list(self.lines), "picture": self.picture[0]}
 
-    def _interrupt(self) -> None:
+    def _signal(self, number: signal.Signals) -> None:
         if self._process is not None and self._process.returncode is None:
             with suppress(ProcessLookupError):  # it has ended by itself just now
-                self._process.send_signal(signal.SIGINT)
+                self._process.send_signal(number)
 
 
 def taught_values(path: Path) -> dict[str, Any]:
-    """Return the parameters that `teach` has written for the tracker, with those that it leaves out as usual.
+    """Return those of `TAUGHT` that `teach` has written, and the usual values of those that it leaves out.
 
     Raises:
         OSError: the file cannot be read.
     """
     usual, sections = to_mapping(VisionTrackerSettings()), yaml.safe_load(read_regular(path, MAX_TEXT_BYTES))
-    values = {name: usual[name] for name in (*LEARNT, "straightening")}
-    return values | {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
+    told = {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
+    return {name: told.get(name, usual[name]) for name in TAUGHT}

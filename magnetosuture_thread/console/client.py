@@ -391,6 +391,12 @@ class RequestHandler:
         self._pending[task] = client
         task.add_done_callback(lambda done: self._pending.pop(done, None))
 
+    def release(self, client: int) -> None:
+        """Release control; what a page has let the rig measure ends with that."""
+        if client == self.jog.holder:
+            self._host.cancel()
+        self.jog.release_control(client)
+
     async def close(self) -> None:
         """Cancel pending requests."""
         for task in (tasks := list(self._pending)):
@@ -464,7 +470,7 @@ class Client:
                     await receive(message.type, message.data)
         finally:
             if self._jog.holder == self.number:
-                self._jog.release_control(self.number)
+                self._requests.release(self.number)
                 # Nobody is there who would see what the needle does.
                 disarm = ClientMessage("bridge_action", {"action": "disarm"})
                 self._requests.start(self.number, disarm, "nobody", lambda name, refusal: None)
@@ -554,7 +560,7 @@ class Client:
             case "acquire_control":
                 self._report(message.type, jog.acquire_control(self.number))
             case "release_control":
-                jog.release_control(self.number)
+                self._requests.release(self.number)
             case "visibility":
                 jog.set_visible(self.number, values["visible"])
             case _ if late:

@@ -24,8 +24,6 @@ from magnetosuture_thread.vision.tracker import VisionTracker
 MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
 MAX_TILT = math.radians(35.0)
 MAX_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
-# Settings of the tracker that a file names where they are not the usual ones.
-LEARNT = ("region_px", "rim", "max_needle_brightness", "needle_colour", "needle_is_blunt", "max_needle_bend")
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
 
 
@@ -67,7 +65,14 @@ class Calibration:
             "camera_rotation": round(float(self.view.rotation), 6),
         }
         usual = VisionTrackerSettings()
-        for name in LEARNT:
+        for name in (
+            "region_px",
+            "rim",
+            "max_needle_brightness",
+            "needle_colour",
+            "needle_is_blunt",
+            "max_needle_bend",
+        ):
             value = getattr(self.looked, name)
             if value != getattr(usual, name):
                 values[name] = [round(each, 4) for each in value] if isinstance(value, tuple) else value

@@ -203,7 +203,7 @@ class RecordingHost:
             **{"can_pause": True, "paused": False, "can_record": True, "recording": "", "busy": "", "simulated": True},
             **{"can_measure": True, "measurement": None},
         }
-        self.shot = b""
+        self.shot, self.cancelled = b"", 0
 
     def state(self) -> dict[str, Any]:
         """Return what is shown now."""
@@ -238,6 +238,7 @@ class RecordingHost:
 
     def cancel(self) -> None:
         """End the measurement."""
+        self.cancelled += 1
         if self.shown["measurement"] is not None:
             self.shown["measurement"]["state"] = "failed"
 

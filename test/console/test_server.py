@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import math
+import time
 
 import aiohttp
 import pytest
@@ -109,6 +110,30 @@ def test_requests_of_the_page_with_control_reach_the_host_and_the_graph():
         here.graph.refusal = "no planner"
         await page.send(type="procedure", action="plan", procedure="slalom", hold_to_run=True)
         await until(lambda: here.graph.procedures == [("plan", "slalom", True)])
+
+    run(test)
+
+
+def test_a_measurement_ends_with_what_stops_the_bridge_and_with_the_page():
+    async def test(here: Console) -> None:
+        page, watcher = await here.page(), await here.page()
+        await page.acquire_control()
+        await page.send(type="measure", action="commission", marks=[], sent=time.monotonic())
+        await until(lambda: here.host.requests == [("commission", ())])
+        await watcher.send(type="bridge_action", action="disarm")
+        await until(lambda: here.host.cancelled == 1)
+        await watcher.send(type="bridge_action", action="stop")
+        await until(lambda: here.host.cancelled == 2)
+        await watcher.send(type="measure", action="cancel", marks=[])
+        await until(lambda: here.host.cancelled == 3 and here.graph.actions[-1] == "disarm")
+        await watcher.send(type="measure", action="commission", marks=[], sent=time.monotonic())
+        await until(lambda: watcher.of("error"))
+        await page.send(type="release_control")
+        await until(lambda: here.host.cancelled == 4)
+        await page.acquire_control()
+        page.tear()
+        await until(lambda: here.host.cancelled >= 5)
+        assert here.host.requests == [("commission", ())]
 
     run(test)
 

@@ -47,7 +47,7 @@ def test_late_jog_messages_are_rejected_and_a_late_page_is_disconnected():
         await page.acquire_control()
         await page.jog(1, 0, sent=100.0)
         await page.jog(0, 1, sent=99.84)
-        await until(lambda: here.graph.last == REST)
+        await until(lambda: here.graph.last == REST and page.of("error"))
         assert "late" in page.of("error")[0]["text"]
         assert NORTH not in here.graph.velocities
         while not page.socket.closed:

@@ -69,7 +69,8 @@ def test_a_needle_is_taught_by_its_marked_ends_and_the_tracker_goes_on_with_what
 
     shown = asyncio.run(teach())
     assert shown["state"] == "done", shown["lines"]
-    assert shown["lines"][-1] == "the tracker that runs has these parameters until it ends"
+    assert shown["lines"][-1] == "the tracker that runs knows this needle until it ends; its view is as before"
+    assert not tracker.configured_settings.metres_per_pixel  # so that a dish that is moved is noticed
     assert host.picture().startswith(b"\x89PNG")
     assert len(list(tmp_path.glob("*_petri_35mm_polyamide_taught/tracker.yaml"))) == 1
     assert tracker.configured_settings.needle_length == pytest.approx(LENGTH, rel=0.02)
@@ -124,3 +125,49 @@ def test_nothing_is_taught_while_the_coils_are_armed(graph: Any, host: Recording
     bridge.armed(graph)
     graph.wait(lambda: (host.graph.state()["bridge"] or {}).get("armed"), "an armed bridge")
     assert "disarm first" in asyncio.run(host.measure("teach", (1.0, 2.0, 3.0, 4.0)))
+
+
+def test_a_tracker_that_refuses_what_was_taught_goes_on_as_before(graph: Any, host: RecordingHost):
+    tracker = graph.add(VisionTrackerNode, scene="dish_35mm")
+    problem = asyncio.run(host._change_tracker({"needle_is_blunt": True, "needle_length": -1.0}))
+    assert "needle_length" in problem
+    assert "off" not in problem
+    assert graph.stage("vision_tracker") == "active"
+    assert (tracker.configured_settings.needle_is_blunt, tracker.configured_settings.needle_length) == (False, LENGTH)
+
+
+def test_a_commissioning_goes_on_in_its_folder_until_it_is_finished(
+    host: RecordingHost, monkeypatch: pytest.MonkeyPatch
+):
+    folders: list[Path] = []
+
+    async def run(measured: measurement.Measurement, arguments: list[str]) -> bool:
+        folders.append(Path(arguments[arguments.index("--output") + 1]))
+        folders[-1].mkdir(exist_ok=True)
+        return len(folders) == 2
+
+    monkeypatch.setattr(measurement.Measurement, "run", run)
+
+    async def commission() -> dict[str, Any]:
+        assert await host.measure("commission", ()) == ""
+        return await ended(host)
+
+    assert asyncio.run(commission())["state"] == "failed"
+    shown = asyncio.run(commission())
+    assert shown["state"] == "done"
+    assert shown["lines"][0].startswith(f"goes on in {folders[0]}")
+    assert folders[0] == folders[1]
+    (folders[0] / "summary.json").touch()
+    asyncio.run(commission())
+    assert folders[2] != folders[0]
+
+
+def test_a_graph_of_which_nobody_knows_the_setup_is_not_measured(graph: Any, tmp_path: Path):
+    with Participant("console", domain=graph.domain) as page:
+        shown, setup = ConsoleGraph(page.node, ConsoleSettings()), read_setup("petri_35mm_polyamide")
+        host = RecordingHost(shown, setup, tmp_path, print, measures=False)
+        assert not host.state()["can_measure"]
+        assert "console SETUP --graph" in asyncio.run(host.measure("commission", ()))
+        shown.begin(ConsoleSettings(scene="dish_150mm"))
+        host = RecordingHost(shown, setup, tmp_path, print)
+        assert "dish of 150 mm is not the setup's of 35 mm" in asyncio.run(host.measure("commission", ()))
