@@ -325,7 +325,7 @@ class RecordingHost(GraphHost):
     async def _teach(self, measurement: Measurement, marks: tuple[float, ...]) -> str:
         """Let the tracker learn the needle from what the camera shows now; return what went wrong."""
         folder = new_name(self._recordings, f"{self.setup.name}_taught")
-        told = folder / "tracker.yaml"
+        output = folder / "tracker.yaml"
         folder.mkdir(parents=True)
         raw = self.graph.settings.image_transport == "raw"
         camera = [topics.IMAGE if raw else topics.COMPRESSED_IMAGE, topics.CAMERA_INFO]
@@ -335,12 +335,12 @@ class RecordingHost(GraphHost):
         await bag.end()
         tail, tip = ([f"{value:.2f}" for value in mark] for mark in (marks[:2], marks[2:]))
         arguments = [str(bag.output), "--tail", *tail, "--tip", *tip, "--setup", str(self.setup.path)]
-        is_taught = await measurement.run([*arguments, "--output", str(told)])
-        if (picture := told.with_suffix(".png")).is_file():
+        is_taught = await measurement.run([*arguments, "--output", str(output)])
+        if (picture := output.with_suffix(".png")).is_file():
             measurement.picture = folder.name, picture.read_bytes()
         if not is_taught or measurement.cancelled or self._is_armed():
             return "not given to the tracker: the coils are armed" if is_taught and self._is_armed() else "not taught"
-        values, setup = taught_values(told), self.setup.vision.needle_length
+        values, setup = taught_values(output), self.setup.vision.needle_length
         if problem := await self._change_tracker(values):
             return problem
         measurement.lines.append("the tracker that runs knows this needle until it ends; its view is as before")

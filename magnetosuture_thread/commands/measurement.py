@@ -117,5 +117,5 @@ def taught_values(path: Path) -> dict[str, Any]:
         OSError: the file cannot be read.
     """
     usual, sections = to_mapping(VisionTrackerSettings()), yaml.safe_load(read_regular(path, MAX_TEXT_BYTES))
-    told = {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
-    return {name: told.get(name, usual[name]) for name in TAUGHT}
+    written = {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
+    return {name: written.get(name, usual[name]) for name in TAUGHT}
