@@ -40,8 +40,8 @@ from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, S
 TOKEN = "MAGNETOSUTURE_TOKEN"
 TRACKER = "vision_tracker"
 TAUGHT_TIME = 1.0  # s of frames, in the first of which the needle is marked
-SAME_DISH = 1e-5  # m
-SAME_LENGTH = 0.02  # of a needle, as a share; marks are less certain than that
+SAME_DISH = 1e-5  # m; two dishes differ by more
+SAME_LENGTH = 0.02  # of a needle, as a share; as far as marks tell, and less than keep_out of every setup
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
@@ -340,12 +340,13 @@ class RecordingHost(GraphHost):
             measurement.picture = folder.name, picture.read_bytes()
         if not is_taught or measurement.cancelled or self._is_armed():
             return "not given to the tracker: the coils are armed" if is_taught and self._is_armed() else "not taught"
-        values, setup = taught_values(output), self.setup.vision.needle_length
+        (length, values), believed = taught_values(output), self.setup.vision.needle_length
+        if abs(length / believed - 1.0) > SAME_LENGTH:
+            sizes = f"the needle is {1e3 * length:.2f} mm long, and {1e3 * believed:.2f} mm in the setup"
+            return f"{sizes}: copy the parameters into it, and start its nodes anew"
         if problem := await self._change_tracker(values):
             return problem
-        measurement.lines.append("the tracker that runs knows this needle until it ends; its view is as before")
-        if abs(values["needle_length"] / setup - 1.0) > SAME_LENGTH:
-            measurement.lines.append(f"the setup's needle is {1e3 * setup:.2f} mm long: copy these parameters into it")
+        measurement.lines.append("the tracker that runs knows how the needle looks until it ends")
         return ""
 
     async def _change_tracker(self, values: Mapping[str, Any]) -> str:

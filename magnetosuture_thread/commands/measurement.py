@@ -24,15 +24,9 @@ from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 TEACH = "teach"
-# Parameters of a tracker that runs which change. Its view stays, with the check that the dish is where it was.
-TAUGHT = (
-    "needle_length",
-    "needle_width",
-    "max_needle_brightness",
-    "needle_colour",
-    "needle_is_blunt",
-    "max_needle_bend",
-)
+# How a needle looks, which a tracker that runs is told. Its length stays, as the bridge keeps that needle off shapes;
+# so does its view, with the check that the dish is where it was.
+TAUGHT = ("needle_width", "max_needle_brightness", "needle_colour", "needle_is_blunt", "max_needle_bend")
 RUNNING, DONE, FAILED = "running", "done", "failed"
 MAX_LINES, MAX_CHARS = 40, 400  # that a page is sent
 END_TIMEOUT = 20.0  # s for a command to end by itself, once it is cancelled: it starts nodes anew as they were
@@ -110,12 +104,12 @@ class Measurement:
                 self._process.send_signal(number)
 
 
-def taught_values(path: Path) -> dict[str, Any]:
-    """Return those of `TAUGHT` that `teach` has written, and the usual values of those that it leaves out.
+def taught_values(path: Path) -> tuple[float, dict[str, Any]]:
+    """Return the needle's length that `teach` has written [m], and `TAUGHT`, the usual values where it leaves them out.
 
     Raises:
         OSError: the file cannot be read.
     """
     usual, sections = to_mapping(VisionTrackerSettings()), yaml.safe_load(read_regular(path, MAX_TEXT_BYTES))
     written = {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
-    return {name: written.get(name, usual[name]) for name in TAUGHT}
+    return float(written["needle_length"]), {name: written.get(name, usual[name]) for name in TAUGHT}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ async def ended(host: RecordingHost, meanwhile: Callable[[], None] = lambda: Non
 def test_a_needle_is_taught_by_its_marked_ends_and_the_tracker_goes_on_with_what_was_learnt(
     graph: Any, host: RecordingHost, camera: Any, thread_arc: Any, tmp_path: Path
 ):
-    tracker = graph.add(VisionTrackerNode, scene="dish_35mm", needle_length=6e-3)  # of which nobody knows better
+    tracker = graph.add(VisionTrackerNode, scene="dish_35mm", needle_width=6e-4, max_needle_brightness=0.9)
     poses, image = graph.listen(topics.NEEDLE_POSE), frame(camera, thread_arc)
     tip = TAIL + LENGTH * np.array([np.cos(HEADING), np.sin(HEADING)])
     marks = camera.view.to_pixels(np.array([TAIL, tip])).ravel().tolist()
@@ -69,11 +70,14 @@ def test_a_needle_is_taught_by_its_marked_ends_and_the_tracker_goes_on_with_what
 
     shown = asyncio.run(teach())
     assert shown["state"] == "done", shown["lines"]
-    assert shown["lines"][-1] == "the tracker that runs knows this needle until it ends; its view is as before"
+    assert shown["lines"][-1] == "the tracker that runs knows how the needle looks until it ends"
     assert not tracker.configured_settings.metres_per_pixel  # so that a dish that is moved is noticed
     assert host.picture().startswith(b"\x89PNG")
     assert len(list(tmp_path.glob("*_petri_35mm_polyamide_taught/tracker.yaml"))) == 1
-    assert tracker.configured_settings.needle_length == pytest.approx(LENGTH, rel=0.02)
+    settings = tracker.configured_settings
+    assert settings.needle_width == pytest.approx(4e-4, rel=0.2)
+    assert settings.max_needle_brightness < 0.9
+    assert settings.needle_length == LENGTH  # as the other nodes have it
     poses.clear()
 
     def seen() -> bool:
@@ -82,6 +86,26 @@ def test_a_needle_is_taught_by_its_marked_ends_and_the_tracker_goes_on_with_what
         return bool(poses)
 
     graph.wait(seen, "a pose of the needle that was taught")
+
+
+def test_a_needle_of_another_length_is_told_to_no_node_alone(
+    graph: Any, host: RecordingHost, camera: Any, thread_arc: Any
+):
+    """The bridge would keep another needle off the shapes than the tracker sees."""
+    tracker, image = graph.add(VisionTrackerNode, scene="dish_35mm"), frame(camera, thread_arc)
+    host.setup = replace(host.setup, vision=replace(host.setup.vision, needle_length=6e-3))
+    tip = TAIL + LENGTH * np.array([np.cos(HEADING), np.sin(HEADING)])
+    marks = camera.view.to_pixels(np.array([TAIL, tip])).ravel().tolist()
+    before = tracker.configured_settings
+
+    async def teach() -> dict[str, Any]:
+        assert await host.measure("teach", tuple(marks)) == ""
+        return await ended(host, lambda: graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now())))
+
+    shown = asyncio.run(teach())
+    assert shown["state"] == "failed"
+    assert "and 6.00 mm in the setup: copy the parameters into it" in shown["lines"][-1]
+    assert tracker.configured_settings is before
 
 
 def test_a_commissioning_that_the_bridge_refuses_says_the_way_out(graph: Any, host: RecordingHost):

@@ -185,7 +185,7 @@ find("ruler").addEventListener("click", ({ currentTarget }) => {
 });
 // Where nothing else tells which end of the needle is its tip, a click does.
 find("dish").addEventListener("click", ({ offsetX, offsetY }) => {
-  if (!hasControl() || ruler.on || measurement.marks || !undirectedAxis(state.graph, since()) || !dish.placement) return;
+  if (!hasControl() || ruler.on || !undirectedAxis(state.graph, since()) || !dish.placement) return;
   connection.send({ type: "tip", position: dish.placement.back([offsetX, offsetY]) });
 });
 function showLegend(shown) {
