@@ -38,7 +38,9 @@ MIN_JUDGED = 0.2  # s; poses that are no farther apart are judged, also by a bri
 MAX_BLIND_TURN = 0.35  # rad; between two poses: of a crossing of a coil's axis, which ends also where poses get lost
 STILL = "a motion that leaves the tip where it is"
 NO_SCENE, NO_POSE = "no scene", "no needle pose"
-NO_PREDICTION, CURRENT_LIMIT = "no prediction", "current"  # constraints of the bridge, besides those of the filter
+# Constraints of the bridge, besides those of the filter.
+NO_PREDICTION, CURRENT_LIMIT, FIRST_MOTION = "no prediction", "current", "first motion"
+FIRST_SPEED, FIRST_WAY = 2e-3, 0.01  # m/s and m; of a needle that moves for the first time with a setup
 
 
 NO_VELOCITY: Vector = np.zeros(2)
@@ -133,6 +135,7 @@ class CoilBridge:
         extrapolator: extrapolates the needle's pose.
         prediction_monitor: monitors the thread model's margins.
         stamp_ages: how old commands and poses are when they arrive.
+        first_way: how far the needle still has to follow, before it is driven faster than `FIRST_SPEED` [m].
         scene_problem: why the scene that was heard last is not in force, while the currents are zero; empty if it is.
 
     Raises:
@@ -167,6 +170,7 @@ class CoilBridge:
         self._stopped: float | None = None
         self._pose_stamp = -math.inf
         self._turned = 0.0  # by which the needle was turned since the last pose [rad]
+        self.first_way = 0.0
         self.set_scene(scene)
 
     @property
@@ -250,6 +254,9 @@ class CoilBridge:
             at_shape = self._filter.clearance(tail, heading) < self._filter.keep_out
             if problem := self._follow.update(motion, at_shape):
                 self.latch.trip(problem)
+            elif driven := math.hypot(*motion.driven):
+                followed = min(driven, max(0.0, float(motion.measured @ motion.driven) / driven))
+                self.first_way = max(0.0, self.first_way - followed)
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
         """Register the thread model's margins; see `PredictionMonitor.update`."""
@@ -325,7 +332,9 @@ class CoilBridge:
             selected = selected._replace(tip=self._needle.kinematics.tip_velocity(pose.heading, commanded))
         no_prediction = self.prediction_monitor.stale_reason(now, arrival)
         reasons = self._stop_reasons(arrival, then, driver, selected, no_prediction)
-        active: tuple[str, ...] = (NO_PREDICTION,) if no_prediction else ()
+        slowly = FIRST_SPEED if self.first_way else math.inf
+        limits = NO_PREDICTION if no_prediction else "", FIRST_MOTION if math.hypot(*selected.tip) > slowly else ""
+        active = tuple(filter(None, limits))
         if reasons or pose is None or self._filter is None:
             self._follow.end_probe()
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
@@ -348,7 +357,8 @@ class CoilBridge:
             self._filter.set_time(now, self.extrapolator.first_stamp)
             # Of the end that is turned ahead, which is the swifter one.
             swiftest = math.hypot(commanded.along, abs(commanded.across) + kinematics.lever * abs(commanded.turn_rate))
-            limited = min(slowdown, max_speed / max(swiftest, 1e-300))
+            driven = math.hypot(commanded.along, commanded.across)  # a turn is no way, and ends an instability soon
+            limited = min(slowdown, max_speed / max(swiftest, 1e-300), slowly / max(driven, 1e-300))
             twist = commanded.scaled(limited)
             wanted = kinematics.tip_velocity(pose.heading, twist)
             if not compensates:  # what is driven across the needle counts as a part of its turn
@@ -360,7 +370,7 @@ class CoilBridge:
                 pose.tail,
                 pose.heading,
                 slowdown=slowdown,
-                max_speed=max_speed,
+                max_speed=min(max_speed, slowly),
                 previous=self._velocity,
                 elapsed=elapsed,
                 time=now,

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
+from magnetosuture_thread.coils.bridge import FIRST_WAY, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch, RecordedState, StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -80,6 +80,7 @@ class CoilSystem:
         self._record = record
         self.driver_name = "none"
         self._auto_arm, self._max_timeout = False, 0.0
+        self._identity = self._followed = ""  # of the setup, and of that with which a needle has followed
         self._imported: tuple[str, ...] = ()
 
     @property
@@ -103,6 +104,7 @@ class CoilSystem:
         """Latch what a record holds of the process before, and keep the latch in it from now on."""
         self._record = record
         found = record.read()
+        self._followed = record.followed or self._followed
         if found is RecordedState.STOPPED:
             self.latch.stop()
         elif found is RecordedState.ARMED and not self.latch.armed:
@@ -123,6 +125,7 @@ class CoilSystem:
             state = RecordedState.STOPPED
         else:
             state = RecordedState.ARMED if (self.latch.armed or self.latch.fault) and not ends else RecordedState.SAFE
+        self._record.followed = self._followed
         try:
             self._record.write(state)
         except (OSError, ValueError) as error:
@@ -149,12 +152,17 @@ class CoilSystem:
     def open(self, settings: CoilBridgeSettings, bridge: CoilBridge, driver: CoilDriver) -> None:
         """Open a driver; from now on each step applies currents, zero at first.
 
+        One that may move something moves the needle slowly at first, unless one has followed with this setup before.
+
         Raises:
             ConfigurationError: the bridge would arm itself with a driver that may move something.
         """
-        if settings.autostart == "armed" and not getattr(driver, "moves_nothing", False):
+        moves_nothing = getattr(driver, "moves_nothing", False)
+        if settings.autostart == "armed" and not moves_nothing:
             raise settings.refused("autostart", "active at most: what may move something is armed by a person")
-        self._max_timeout = math.inf if getattr(driver, "moves_nothing", False) else settings.driver_timeout
+        self._max_timeout = math.inf if moves_nothing else settings.driver_timeout
+        self._identity = settings.identity
+        bridge.first_way = 0.0 if moves_nothing or self._identity == self._followed else FIRST_WAY
         self.driver, self.driver_name = driver, settings.driver
         driver.open()
         self.bridge, self.timing = bridge, LoopTiming(1.0 / settings.rate)
@@ -242,4 +250,6 @@ class CoilSystem:
         self.bridge.scene_problem = scene_problem
         self.output = self.bridge.step(now, arrival, state)
         self.driver.apply(self.output.allocation.currents, arrival)
+        if self.bridge.first_way <= 0.0:
+            self._followed = self._identity  # recorded with the next switch: the loop does not wait for the disk
         return self.output

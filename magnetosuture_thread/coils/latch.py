@@ -130,20 +130,27 @@ class RecordedState(Enum):
 
 
 class StopRecord:
-    """A file that holds the state of a bridge, on the disk when `write` returns.
+    """A file that holds the state of a bridge and the setup it has moved a needle with, on the disk after `write`.
 
     Args:
         path: of the file; its folder is made with the first `write`.
+
+    Attributes:
+        followed: identity of the setup with which a needle has followed, in hexadecimal digits; empty if none.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._written: RecordedState | None = None
+        self.path, self.followed = path, ""
+        self._written: tuple[RecordedState, str] | None = None
 
     def read(self) -> RecordedState:
         """Return the state that was left behind; without a file none, and of a damaged one the emergency stop."""
         try:
-            return RecordedState(read_regular(self.path, 1000).decode().strip())
+            state, *rest = read_regular(self.path, 1000).decode().split() or [""]
+            if rest and (len(rest) > 1 or not rest[0].isalnum()):
+                return RecordedState.STOPPED
+            self.followed = "".join(rest)
+            return RecordedState(state)
         except FileNotFoundError:
             return RecordedState.SAFE
         except (OSError, ValueError):
@@ -155,7 +162,8 @@ class StopRecord:
         Raises:
             OSError: it cannot be written.
         """
-        if state is self._written:
+        lines = state, self.followed
+        if lines == self._written:
             return
         self._written = None
         if problem := output_problem(self.path):
@@ -164,7 +172,7 @@ class StopRecord:
         partial = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
             with partial.open("w", encoding="utf-8") as stream:
-                stream.write(f"{state.value}\n")
+                stream.writelines(f"{line}\n" for line in (state.value, self.followed) if line)
                 stream.flush()
                 os.fsync(stream.fileno())
             partial.replace(self.path)
@@ -176,4 +184,4 @@ class StopRecord:
             os.fsync(folder)  # else the name may still be that of the file before, after a power failure
         finally:
             os.close(folder)
-        self._written = state
+        self._written = lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os.path
 from dataclasses import dataclass
@@ -230,6 +231,13 @@ class CoilBridgeSettings(
         if self._calibration is not None:
             return self._calibration.coils
         return coils_around(self.coil_angles, self.coil_distance, self.coil_radius, self.field_per_current)
+
+    @property
+    def identity(self) -> str:
+        """Digits that differ between setups whose coils, needle, delay or boards differ."""
+        boards = self.driver, self.roboclaw_ports, self.roboclaw_addresses
+        what = repr((self.coils_properties(), self.needle(), self.motion_delay, boards))
+        return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def resistances(self) -> tuple[float, ...]:
         """Return each coil's resistance with its cable, as calibrated if known [ohm]."""

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
+from magnetosuture_thread.coils.bridge import FIRST_MOTION, FIRST_SPEED, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -597,3 +597,35 @@ def test_after_a_stop_the_needle_starts_from_rest():
     first = plant.run(PERIOD)[0]
     assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
     assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
+
+
+@pytest.mark.parametrize("compensates", [False, True])
+@pytest.mark.parametrize("twist", [(0.008, 0.0), (0.006, 0.004), (0.008, 0.0, 0.1)])
+def test_a_needle_that_moves_for_the_first_time_is_driven_slowly_until_it_has_followed(
+    compensates: bool, twist: tuple[float, ...]
+):
+    """Poses that move, and not as commanded, do not count."""
+    plant = Plant(CoilBridgeSettings(motion_compensation=compensates), Scene(Dish(0.08)), velocity=twist).ready()
+    plant.bridge.first_way = 2e-3
+    places = [tail for tail, _ in driven(plant, 400, tail=TAIL - np.array([0.01, 0.0]), latency=2, interval=4)]
+    steps = np.hypot(*np.diff(places, axis=0).T)
+    travel = np.cumsum(steps)
+    outputs = [output for _, output in plant.outputs][1:]
+    slow = [FIRST_MOTION in output.active for output in outputs[10:]]
+    since = 10 + slow.index(False)
+    assert all(slow[: since - 10])
+    assert not any(slow[since - 10 :])
+    assert steps[:since].max() < 1.05 * FIRST_SPEED * PERIOD
+    assert 1.9e-3 < travel[since] < 2.3e-3
+    assert steps[since + 20 :].max() > 0.006 * PERIOD
+
+
+@pytest.mark.parametrize("shown", [(0.0, 0.0), (0.0, -1.0), (-0.5, 0.0)])
+def test_poses_that_do_not_follow_end_no_first_motion(shown: tuple[float, float]):
+    """They stand still, move to a side, or back."""
+    plant = Plant(velocity=(0.008, 0.0)).ready()
+    plant.bridge.first_way, error = 2e-3, np.zeros(2)
+    for tail, heading in driven(plant, 400, error=error, latency=2, interval=4):
+        way = tail - TAIL + 0.0035 * (heading - EAST)  # of the middle
+        error[:] = way - math.hypot(*way) * np.array(shown)
+    assert plant.bridge.first_way > 1.8e-3

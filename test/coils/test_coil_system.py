@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.coils.bridge import CoilBridge
+from magnetosuture_thread.coils.bridge import FIRST_WAY, CoilBridge
 from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import RecordingDriver
 from magnetosuture_thread.coils.latch import StopRecord
@@ -78,3 +78,42 @@ def test_only_barriers_that_were_named_at_the_start_or_imported_by_others_are_ta
     for name in (neither, "not_installed_yet:Another"):
         with pytest.raises(ConfigurationError, match="named when the node started"):
             system.check_barriers([named, name])
+
+
+class MovingDriver(RecordingDriver):
+    """A driver of something that moves."""
+
+    moves_nothing = False
+
+
+def opened(path: Path, settings: CoilBridgeSettings, driver: type[RecordingDriver] = MovingDriver) -> CoilSystem:
+    """Return the system of a process that has begun with a setup."""
+    system = CoilSystem()
+    system.recall(StopRecord(path))
+    system.open(settings, CoilBridge(settings, system.latch, Scene()), driver(4))
+    return system
+
+
+def test_a_setup_that_a_needle_has_not_followed_with_moves_it_slowly_at_first(tmp_path: Path):
+    path, known, changed = tmp_path / "bridge.stop", CoilBridgeSettings(), CoilBridgeSettings(coil_distance=0.06)
+    system = opened(path, known)
+    assert system.bridge.first_way == FIRST_WAY
+    system.remember(ends=True)
+    assert opened(path, known).bridge.first_way == FIRST_WAY  # none has followed yet
+    system.bridge.first_way = 0.0
+    system.step(500.0, 100.0)
+    system.remember(ends=True)
+    assert opened(path, known).bridge.first_way == 0.0
+    assert opened(path, changed).bridge.first_way == FIRST_WAY
+    assert opened(path, changed, RecordingDriver).bridge.first_way == 0.0
+    path.unlink()
+    assert opened(path, known).bridge.first_way == FIRST_WAY
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"coil_angles": (0.1, 1.6, 3.1, 4.7)}, {"needle_moment": 1e-3}, {"motion_delay": 0.03}, {"needle_drag": 0.03}],
+)
+def test_what_moves_the_needle_otherwise_is_another_setup(change):
+    assert CoilBridgeSettings(**change).identity != CoilBridgeSettings().identity
+    assert CoilBridgeSettings(max_speed=0.01, rate=100.0).identity == CoilBridgeSettings().identity

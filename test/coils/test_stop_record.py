@@ -47,7 +47,7 @@ def test_it_is_on_the_disk_before_the_file_of_before_is_replaced(path, monkeypat
     assert calls == ["sync", "replace", "sync"]
 
 
-@pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"stop", b"x" * 100_000])
+@pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"stop", b"disarmed a b", b"disarmed -", b"x" * 100_000])
 def test_a_damaged_file_is_an_emergency_stop(path, damage):
     path.parent.mkdir()
     path.write_bytes(damage)
