@@ -352,7 +352,8 @@ class CoilBridge:
         # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
         slowed = selected.source == OPERATOR or settings.friction_feedback == "all"
         slowdown = self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0
-        kinematics, pull = self._needle.kinematics, self._observer.pull(pose.heading) if compensates else None
+        kinematics, counted = self._needle.kinematics, self._follow.counted_pull(self._observer.velocity)
+        pull = self._observer.pull(pose.heading, counted) if compensates else None
         if in_needle_frame:
             self._filter.set_time(now, self.extrapolator.first_stamp)
             # Of the end that is turned ahead, which is the swifter one.
@@ -417,11 +418,11 @@ class CoilBridge:
         n = np.array([-e[1], e[0]])
         applied = (motion.along - pulled.along) * e + own_drift * n
         # Where the force that is allowed does not suffice, what was intended is the wanted velocity.
-        intended = twist.along * e + twist.across * n if limiting == SPEED else applied + self._observer.velocity
+        intended = twist.along * e + twist.across * n if limiting == SPEED else applied + counted
         self._observer.apply(now, applied, intended, motion.turn_rate)
         self._follow.register_turn(motion.turn_rate * period)
         self._turned += motion.turn_rate * period
-        return self._output(selected, (), active, slowdown, self._observer.velocity if compensates else NO_VELOCITY)
+        return self._output(selected, (), active, slowdown, counted if compensates else NO_VELOCITY)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""

@@ -88,9 +88,9 @@ class MotionObserver:
         """The velocity d in the dish's frame, shape (2,) [m/s]."""
         return self._velocity
 
-    def pull(self, heading: Vector) -> NeedleTwist:
-        """Return d as the motion of a needle with a heading, a unit vector at its tail of shape (2,)."""
-        (ex, ey), (x, y) = self._needle.chord_direction(heading), self._velocity
+    def pull(self, heading: Vector, velocity: Vector | None = None) -> NeedleTwist:
+        """Return d, or a velocity of shape (2,) [m/s] in its place, as the motion of a needle with a unit heading."""
+        (ex, ey), (x, y) = self._needle.chord_direction(heading), self._velocity if velocity is None else velocity
         return NeedleTwist(float(ex * x + ey * y), float(ex * y - ey * x), 0.0)
 
     def place_deviation(self, now: float) -> float:
@@ -324,6 +324,14 @@ class FollowMonitor:
     def register_turn(self, angle: float) -> None:
         """Register by which angle the field was set to turn the needle [rad]."""
         self._turned += angle
+
+    def counted_pull(self, pull: Vector) -> Vector:
+        """Return what is compensated of a pull, shape (2,) [m/s].
+
+        A needle that is held against a pull that grows may stand so still that its place proves nothing. After half of
+        `MAX_UNSEEN` only the pull that was known when it last moved counts: it moves, and is seen to, or it rests.
+        """
+        return self._proven if math.hypot(*self._unseen) > 0.5 * MAX_UNSEEN else pull
 
     def is_trusted(self, stamp: float) -> bool:
         """Return whether a probe has lately shown that the poses are the needle's."""

@@ -155,8 +155,8 @@ class CoilBridgeSettings(
     )
     motion_delay: float = quantity(
         0.0,
-        "from a current to the motion that poses show, by their stamps, as commission measures it; for "
-        "motion_compensation, which corrects it while the needle turns",
+        "from a current to the motion that poses show, by their stamps, as commission measures it; of the needle's "
+        "planner, and for motion_compensation, which corrects it while the needle turns",
         unit="s",
         minimum=0.0,
         maximum=0.2,

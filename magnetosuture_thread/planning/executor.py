@@ -445,7 +445,7 @@ class ProcedureExecutor:
                 raise
             self.path, self._foresees_at = self._left, math.inf
         self._left = None
-        self._tracker, self._reached, self._handover = PathTracker(self.path, self.planner.axes), 0, 0.0
+        self._tracker, self._reached, self._handover = self.planner.tracker(self.path), 0, 0.0
         return True
 
     def _plan_ahead(self, goal: Wrap) -> None:
@@ -481,7 +481,7 @@ class ProcedureExecutor:
         """Return the command that keeps the needle where it was when this began, against what pulls it."""
         limits = self.procedure.limits[self.goal]
         if self._holder is None:
-            self._holder = PathTracker(self.planner.standing_path(middle, angle, limits), self.planner.axes)
+            self._holder = self.planner.tracker(self.planner.standing_path(middle, angle, limits))
         at = stamp, middle, angle, limits.speed, thread.slowdown, thread.pull, thread.age
         return self._holder.compute_command(*at, hold=True).twist
 

@@ -54,6 +54,7 @@ from magnetosuture_thread.planning.procedure import (
     Wrap,
 )
 from magnetosuture_thread.planning.thread_ways import Candidate, ThreadRollout, candidates
+from magnetosuture_thread.planning.tracking import PathTracker
 from magnetosuture_thread.planning.verdict import (
     PASSED,
     GoalJudge,
@@ -127,6 +128,7 @@ class NeedlePlanner:
         thread_length: of the thread behind it [m].
         axes: of the coils, for `PathTracker`.
         model: settings of the thread model, for forecasts; None for those of the thread model's defaults.
+        delay: for `PathTracker` [s].
 
     Attributes:
         looked: states of the lattice that were looked at so far, with what forecasts took as long as.
@@ -143,12 +145,13 @@ class NeedlePlanner:
         thread_length: float,
         axes: Sequence[tuple[float, float]] = (),
         model: ThreadModelSettings | None = None,
+        delay: float = 0.0,
     ) -> None:
         least = needle.chord + 2.0 * keep_out
         if scene.dish.diameter <= least:
             expected = f"more than {least:g} m, room for the needle and the clearance on both sides"
             raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
-        self.scene, self.needle, self.axes = scene, needle, tuple(axes)
+        self.scene, self.needle, self.axes, self.delay = scene, needle, tuple(axes), delay
         self.keep_out, self.thread_length = keep_out, thread_length
         self._model = ThreadModelSettings() if model is None else model
         self.near = map_clearance(scene)
@@ -167,6 +170,10 @@ class NeedlePlanner:
         """Return middle, shape (2,) [m], and angle of the chord [rad] of a needle with this tail and heading."""
         along = self.needle.chord_direction(heading)
         return tail + self.lever * along, math.atan2(float(along[1]), float(along[0]))
+
+    def tracker(self, path: BodyPath) -> PathTracker:
+        """Return what tracks a path with these coils."""
+        return PathTracker(path, self.axes, self.delay)
 
     def check(self, procedure: Procedure, first: int = 0) -> None:
         """Refuse what can be seen to be impossible without planning.

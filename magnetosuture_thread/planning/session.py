@@ -90,11 +90,11 @@ class NeedlePlannerSettings(
     def planner(
         self, scene: Scene, coils: CoilBridgeSettings | None = None, model: ThreadModelSettings | None = None
     ) -> NeedlePlanner:
-        """Return a planner for a scene, that knows the axes of the coil bridge's coils, and the thread model."""
+        """Return a planner for a scene, that knows axes and delay of the coil bridge's coils, and the thread model."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
         clearance = self.keep_out + self.pose_margin  # as the bridge's filter
-        axes = coils.allocation().axes() if coils else ()
-        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, axes, model)
+        axes, delay = (coils.allocation().axes(), coils.motion_delay) if coils else ((), 0.0)
+        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, axes, model, delay)
 
 
 class _Margins(NamedTuple):

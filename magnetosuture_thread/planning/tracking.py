@@ -96,10 +96,11 @@ class PathTracker:
         path: to track.
         axes: directions in which the coils give no force across the needle [rad], each with the velocity across it
             that they hold for each radian off it [m/s], see `CoilAllocation.axes`.
+        delay: from a command to the motion that poses show [s].
     """
 
-    def __init__(self, path: BodyPath, axes: Sequence[tuple[float, float]] = ()) -> None:
-        self.path, self._axes = path, tuple(axes)
+    def __init__(self, path: BodyPath, axes: Sequence[tuple[float, float]] = (), delay: float = 0.0) -> None:
+        self.path, self._axes, self._delay = path, tuple(axes), delay
         self.travel = 0.0
         turning = turning_points(path.middles, path.angles, path.lever)
         self._stops = [(float(path.travel[index]), sense) for index, sense in turning]
@@ -135,7 +136,7 @@ class PathTracker:
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
             pull: velocity of the needle that the bridge measures and compensates, shape (2,) [m/s].
-            age: of the pose when the command is sent [s]; until then the commands before turn the needle.
+            age: of the pose when the command is sent [s]; until it acts the commands before turn the needle.
             hold: the setpoint stands still, and is never done. The command is at least `MIN_HOLD_SPEED`: at a zero
                 command the coils are off, and compensate nothing.
         """
@@ -144,6 +145,7 @@ class PathTracker:
             interval, self._speed = 0.0, 0.0
             self._turns.clear()
         self._stamp = stamp
+        age += self._delay  # when the command acts
         angle += self._turned(stamp, stamp + age)
         e, n = _axes_of(angle)
         stop, sense = self._stops[0]

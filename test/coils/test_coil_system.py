@@ -86,28 +86,31 @@ class MovingDriver(RecordingDriver):
     moves_nothing = False
 
 
-def opened(path: Path, settings: CoilBridgeSettings, driver: type[RecordingDriver] = MovingDriver) -> CoilSystem:
-    """Return the system of a process that has begun with a setup."""
+def opened(
+    path: Path, settings: CoilBridgeSettings, driver: type[RecordingDriver] = MovingDriver
+) -> tuple[CoilSystem, CoilBridge]:
+    """Return system and bridge of a process that has begun with a setup."""
     system = CoilSystem()
     system.recall(StopRecord(path))
-    system.open(settings, CoilBridge(settings, system.latch, Scene()), driver(4))
-    return system
+    bridge = CoilBridge(settings, system.latch, Scene())
+    system.open(settings, bridge, driver(4))
+    return system, bridge
 
 
 def test_a_setup_that_a_needle_has_not_followed_with_moves_it_slowly_at_first(tmp_path: Path):
     path, known, changed = tmp_path / "bridge.stop", CoilBridgeSettings(), CoilBridgeSettings(coil_distance=0.06)
-    system = opened(path, known)
-    assert system.bridge.first_way == FIRST_WAY
+    system, bridge = opened(path, known)
+    assert bridge.first_way == FIRST_WAY
     system.remember(ends=True)
-    assert opened(path, known).bridge.first_way == FIRST_WAY  # none has followed yet
-    system.bridge.first_way = 0.0
+    assert opened(path, known)[1].first_way == FIRST_WAY  # none has followed yet
+    bridge.first_way = 0.0
     system.step(500.0, 100.0)
     system.remember(ends=True)
-    assert opened(path, known).bridge.first_way == 0.0
-    assert opened(path, changed).bridge.first_way == FIRST_WAY
-    assert opened(path, changed, RecordingDriver).bridge.first_way == 0.0
+    assert opened(path, known)[1].first_way == 0.0
+    assert opened(path, changed)[1].first_way == FIRST_WAY
+    assert opened(path, changed, RecordingDriver)[1].first_way == 0.0
     path.unlink()
-    assert opened(path, known).bridge.first_way == FIRST_WAY
+    assert opened(path, known)[1].first_way == FIRST_WAY
 
 
 @pytest.mark.parametrize(

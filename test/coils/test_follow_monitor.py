@@ -159,3 +159,34 @@ def test_what_a_needle_lies_at_may_hold_it_for_a_while_and_not_for_good():
     faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=True) for k in range(40)]
     assert not any(faults[:15])
     assert "needle does not follow: 2 mm expected" in faults[-1]
+
+
+def held_against(monitor: FollowMonitor, pull: NDArray[np.float64], *, moves: bool) -> list[float]:
+    """Hold a turning needle in its place against a pull that was small when it last moved; return what is compensated.
+
+    Where its pull is not compensated it moves with that, if it is one.
+    """
+    counted, place = [], np.zeros(2)
+    for k in range(40):
+        against = monitor.counted_pull(pull)
+        moved = INTERVAL * (pull - against) if moves else np.zeros(2)
+        place = place + moved
+        turn, driven = 0.05, -INTERVAL * against
+        assert monitor.update(MotionStep(k * INTERVAL, INTERVAL, moved, turn, moved, turn, STILL, driven, pull)) == ""
+        counted.append(math.hypot(*against))
+    assert math.hypot(*place) < 4e-4
+    return counted
+
+
+def test_a_pull_that_a_still_place_does_not_show_is_compensated_for_half_of_the_unseen_way():
+    """A needle that is pulled moves then, and is seen to; poses that are not its own drive it no farther."""
+    monitor, small = FollowMonitor(5e-4), np.array([1e-4, 0.0])
+    monitor.update(MotionStep(-1.0, INTERVAL, EAST, 0.0, EAST, 0.0, STILL, EAST, small))
+    counted = held_against(monitor, np.array([1.5e-3, 0.0]), moves=True)
+    assert counted.count(1.5e-3) > 30
+    assert min(counted) == pytest.approx(1e-4)
+    monitor.clear()
+    monitor.update(MotionStep(-1.0, INTERVAL, EAST, 0.0, EAST, 0.0, STILL, EAST, small))
+    counted = held_against(monitor, np.array([1.5e-3, 0.0]), moves=False)
+    assert counted[-1] == pytest.approx(1e-4)
+    assert sum(counted) * INTERVAL < 1.1e-3

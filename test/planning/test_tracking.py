@@ -206,3 +206,19 @@ def test_a_needle_that_moves_on_its_next_path_is_not_called_stalled_by_the_way_o
         at = np.array([x + 6e-5 * (frame % 2), 0.0])
         stalls.append(detector.update(1.0 + frame / RATE, at, 0.0, 1.25e-3, True, travel))
     assert stalls[-1]
+
+
+def test_what_currents_are_late_by_counts_as_the_age_of_poses():
+    """As a bridge that aims a needle which turns: the gain falls, and turns on the way are counted."""
+    late, aged = (PathTracker(path(np.linspace(0.3, 1.2, 80)), AXES, delay) for delay in (0.06, 0.0))
+    for k in range(20):
+        middle, angle = late.path.at(2e-4 * k)
+        pose = (
+            0.05 * k,
+            np.array([middle[0] + 1e-4, middle[1] - 1e-4]),
+            angle - 0.05,
+            0.002,
+            1.0,
+            np.array([1e-3, 2e-3]),
+        )
+        assert late.compute_command(*pose, 0.02).twist == pytest.approx(aged.compute_command(*pose, 0.08).twist)
