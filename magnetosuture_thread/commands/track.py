@@ -37,7 +37,7 @@ from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_refused, draw_region
 from magnetosuture_thread.vision.refused import Refused, refused_needles
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import NO_NEEDLE, State, Track, VisionTracker, no_pose, warm_up
+from magnetosuture_thread.vision.tracker import NO_NEEDLE, State, Track, VisionTracker, warm_up
 from magnetosuture_thread.vision.video import VIDEOS, Video
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -406,13 +406,13 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
 def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> Track:
     """Return what a frame shows."""
     if frame.image is None:
-        return no_pose(State.LOST, frame.problem, None)
+        return Track(State.LOST, frame.problem)
     try:
         if in_sequence and frame.stamp is not None:
             return tracker.track(frame.image, frame.stamp)
         return tracker.look(frame.image)
     except InvalidInputError as error:
-        return no_pose(State.LOST, str(error), None)
+        return Track(State.LOST, str(error))
 
 
 def _refused(frame: FrameFile, track: Track, scene: Scene, settings: VisionTrackerSettings) -> list[Refused]:

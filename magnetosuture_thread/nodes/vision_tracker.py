@@ -19,7 +19,7 @@ from magnetosuture_thread.settings import interface
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import FrameMeasurement, State, Track, TrackerSession, no_pose, warm_up
+from magnetosuture_thread.vision.tracker import FrameMeasurement, State, Track, TrackerSession, warm_up
 
 NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
@@ -102,7 +102,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
-            self._states.publish(packed_tracker_state(stamp, no_pose(self._session.missing, reason, None)))
+            self._states.publish(packed_tracker_state(stamp, Track(self._session.missing, reason)))
             self.health.warn("; ".join(filter(None, (reason, f"before that {self._text}", self._lens_problem))))
 
     def _start_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> None:
@@ -120,7 +120,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         stamp, taken = message.header.stamp, 0.0
         reading.checked_nanoseconds(stamp, f"{self._camera}.header.stamp")  # nothing could be stamped by another
         if self._session is None:
-            self._states.publish(packed_tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None)))
+            self._states.publish(packed_tracker_state(stamp, Track(State.SEARCHING, NO_SCENE)))
             self.health.warn(NO_SCENE)
             return
         try:

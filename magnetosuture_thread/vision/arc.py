@@ -18,7 +18,6 @@ from magnetosuture_thread.vision.images import straighten
 SET_TOLERANCE = 0.1  # of the length as it is set
 FRAMES = 8  # that must agree
 AGREEMENT = 0.02  # share of the length within which they agree
-REVERSED_PX = 3.0  # px; standard deviation, along the axis, of a tail placed where a tip was fitted
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,6 @@ class Arc:
         strip = np.empty((len(along), len(aside)))
         straighten(image, start, along, aside, strip)
         return strip
-
-    @property
-    def axis(self) -> tuple[float, float, float, float]:
-        """First point, angle and curvature, as compiled code takes them."""
-        return float(self.start[0]), float(self.start[1]), float(self.angle), float(self.curvature)
 
     def direction(self, along: float = 0.0) -> np.ndarray:
         """Return the unit tangent after a length, shape (2,)."""
@@ -141,12 +135,12 @@ class MeasuredNeedle:
 
             T C T',    T = [[-1, 0, 0], [0, -1, -l], [0, 0, 1]]
 
-        and `REVERSED_PX` along: what made an end look like the other one has drawn the fit along the axis, too.
+        and 3 px along, one deviation: what made an end look like the other one has drawn the fit along the axis, too.
         """
         turn = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, -self.length_px], [0.0, 0.0, 1.0]])
         covariance = self.covariance
         if covariance is not None:
-            covariance = turn @ covariance @ turn.T + np.diag([REVERSED_PX**2, 0.0, 0.0])
+            covariance = turn @ covariance @ turn.T + np.diag([3.0**2, 0.0, 0.0])
         arc = self.arc.reversed_at(self.length_px)
         return replace(self, arc=arc, covariance=covariance, size_measured=False, tail_shift_px=0.0)
 
@@ -177,10 +171,6 @@ class MeasuredNeedle:
         confidence = 0.5 * self.confidence
         return replace(self, covariance=covariance, confidence=confidence, heading_known=False, tail_shift_px=0.0)
 
-    def pointing(self, toward: np.ndarray) -> MeasuredNeedle:
-        """Return the needle the way round that its middle points in a direction, shape (2,)."""
-        return self if self.middle_direction_px @ toward > 0.0 else self.reversed()
-
     @property
     def tail_px(self) -> np.ndarray:
         """The blunt end as it is drawn, shape (2,) [px]."""
@@ -205,11 +195,6 @@ class MeasuredNeedle:
     def middle_direction_px(self) -> np.ndarray:
         """Unit tangent at the middle, u right and v down, shape (2,)."""
         return self.arc.direction(0.5 * self.length_px)
-
-    @property
-    def curvature_px(self) -> float:
-        """Of the axis [1/px]; positive turns from u towards v, clockwise as seen."""
-        return self.arc.curvature
 
 
 @dataclass(frozen=True)
@@ -257,8 +242,3 @@ class LengthEstimator:
             alike = ordered[first : first + FRAMES]
             if np.ptp(alike) < AGREEMENT * np.median(alike):
                 self.length = float(np.median(alike))
-
-    def size(self, length: float, width: float, metres_per_pixel: float) -> NeedleSize:
-        """Return the size in an image of a needle whose length and width are set [m], by the image's scale [m]."""
-        known, tolerance = (length, SET_TOLERANCE) if self.length is None else (self.length, 0.02)
-        return NeedleSize(known / metres_per_pixel, width / metres_per_pixel, tolerance)

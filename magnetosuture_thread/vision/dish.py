@@ -22,15 +22,11 @@ from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSetti
 
 COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
 MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
-CELL = 2.0  # px; of votes
-RING = 1.03  # ratio of radii of a ring
 BINS = 72  # directions
 ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
 AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
-MIN_RATIO = 0.7  # of the axes: a camera tilted by 45 degrees
 RANGE = 0.21  # of a ring's radius, within which others of its wall and lid are: a lid is up to 18 % larger
 PARALLAX = 0.08  # of the radius, that a lid's ring is shifted by: 15 mm above the floor of 90 mm, tilted by 13 degrees
-MAX_RINGS = 10  # edges of wall and lid
 SUPPORT = 0.6  # share of the directions in which a ring must be seen
 
 RAYS = 180  # along which rings and a wall are measured
@@ -41,7 +37,6 @@ WALL = 0.0025  # m; breadth of a wall and its shadow at most; the two edges of a
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
 TILT_ERROR = math.radians(2.0)  # of a ring's tilt, by light and noise
 CUT_TILT = math.radians(10.0)  # that a dish of which a part is seen does not tell
-NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most; more is hardly used over a dish
 
 DARK_FLOOR = 130.0  # grey levels; a dish, or with a given view a frame, whose median is below may have a dark floor
 SCALE_ERROR = 0.001  # of a scale by a dark wall: how far its light moves the edge
@@ -79,11 +74,9 @@ class Ellipse:
         cosine, sine = math.cos(self.direction), math.sin(self.direction)
         return np.array([[cosine, sine], [-sine, cosine]])
 
-    def points(self, count: int) -> tuple[Points, Points]:
-        """Return points of the ellipse and its outward normals, both of shape (count, 2)."""
-        circle = unit_vectors(count)
-        normals = circle * (self.major, self.minor) @ self.axes
-        return self.at(circle), normals / np.hypot(*normals.T)[:, None]
+    def seen(self, shape: tuple[int, ...], count: int) -> np.ndarray:
+        """Say which of a number of its points lie in an image of a shape (rows, columns), shape (count,)."""
+        return _within(self.at(unit_vectors(count)), shape)
 
     def coordinates(self, points: Points) -> Points:
         """Return points along the shorter and the longer axis, in halves of them, shape (m, 2)."""
@@ -118,7 +111,7 @@ class Ring:
 
 
 def find_rings(image: np.ndarray) -> list[Ring]:
-    """Find the edges of a dish's wall and lid by gradients alone.
+    """Find the edges of a dish's wall and lid by gradients alone, the smallest first.
 
     In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
     is stretched in a few directions, in which the ellipse of a tilted camera is nearly a circle. Around the centres
@@ -149,7 +142,8 @@ def find_rings(image: np.ndarray) -> list[Ring]:
     sets += [_rings_around(gray, max(each, key=lambda ring: ring.support).ellipse) for each in sets if each]
     # Strong rings speak for an ellipse; weak ones are there by chance.
     rings = max(sets, key=lambda each: sum(ring.support**4 for ring in each))
-    return [replace(ring, ellipse=ring.ellipse.scaled(float(factor))) for ring in rings]
+    rings = [replace(ring, ellipse=ring.ellipse.scaled(float(factor))) for ring in rings]
+    return sorted(rings, key=lambda ring: ring.ellipse.major)
 
 
 @dataclass(frozen=True)
@@ -185,10 +179,6 @@ class _Steps:
         before, top, after = before[row, way], top[row, way], after[row, way]
         radius = radii[row + 2] + 0.5 * step * (before - after) / (before - 2.0 * top + after)
         return _Steps(at, radius, way, change[row + 1, way] > 0.0)
-
-    def points(self) -> Points:
-        """Return their places, shape (m, 2) [px]."""
-        return self.at.at(self.radius[:, None] * unit_vectors(RAYS)[self.way])
 
     def most_agreed(self, left: np.ndarray) -> tuple[Ellipse, np.ndarray, int]:
         """Return the ring that most of those left agree on, roughly, those within `AGREEMENT` of it, and their number.
@@ -227,8 +217,9 @@ def _rings_around(gray: Gray, at: Ellipse) -> list[Ring]:
     then the next.
     """
     steps = _Steps.around(gray, at)
-    points, left, found = steps.points(), np.ones(len(steps.way), np.bool_), list[Ring]()
-    for _ in range(MAX_RINGS):
+    points = at.at(steps.radius[:, None] * unit_vectors(RAYS)[steps.way])
+    left, found = np.ones(len(steps.way), np.bool_), list[Ring]()
+    for _ in range(10):  # edges of wall and lid
         begin, own, votes = steps.most_agreed(left)
         left &= ~own
         if votes < 0.2 * RAYS:  # of a dish that is cut off
@@ -239,16 +230,11 @@ def _rings_around(gray: Gray, at: Ellipse) -> list[Ring]:
         apart = np.abs(np.hypot(*ellipse.coordinates(points).T) - 1.0)
         left &= apart > max(AGREEMENT, 2.0 / ellipse.major)
         agree = np.unique(steps.way[apart < max(FINE_AGREEMENT, 1.0 / ellipse.major)])
-        outline = _within(ellipse.points(RAYS)[0], gray.shape)
+        outline = ellipse.seen(gray.shape, RAYS)
         support = min(1.0, len(agree) / max(1, int(outline.sum())))
         if support >= SUPPORT + 0.5 * (1.0 - float(outline.mean())):
             found.append(Ring(ellipse, support))
     return found
-
-
-def inner_ring(rings: list[Ring], *, outer: bool = False) -> Ellipse:
-    """Return the smallest of the rings, or the largest of them."""
-    return (max if outer else min)((ring.ellipse for ring in rings), key=lambda each: each.major)
 
 
 def fitted_robustly(points: Points, begin: Ellipse) -> Ellipse | None:
@@ -306,12 +292,12 @@ def _centres(edges: _Edges, ratio: float) -> list[Points]:
 
     The image was stretched by a ratio in some direction.
     """
-    side, size = min(edges.shape), np.array(edges.shape[::-1])
+    side, size, cell = min(edges.shape), np.array(edges.shape[::-1]), 2.0  # px
     low = -0.15 * side - (ratio - 1.0) * size
-    wide, tall = np.ceil((size + 0.15 * side + 2.0 * (ratio - 1.0) * size - low) / CELL).astype(int)
-    radii = np.arange(MIN_RADIUS * side, MAX_RADIUS * side, CELL)
+    wide, tall = np.ceil((size + 0.15 * side + 2.0 * (ratio - 1.0) * size - low) / cell).astype(int)
+    radii = np.arange(MIN_RADIUS * side, MAX_RADIUS * side, cell)
     steps = np.concatenate([-radii, radii])[:, None, None]
-    cells = np.floor((edges.points + steps * edges.normals - low) / CELL).astype(int).reshape(-1, 2)
+    cells = np.floor((edges.points + steps * edges.normals - low) / cell).astype(int).reshape(-1, 2)
     cells = cells[((cells >= 0) & (cells < (wide, tall))).all(axis=1)]
     votes = np.bincount(cells[:, 1] * wide + cells[:, 0], minlength=wide * tall).reshape(tall, wide)
     votes = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), 1.5)
@@ -320,7 +306,7 @@ def _centres(edges: _Edges, ratio: float) -> list[Points]:
     for _ in range(4):
         _, _, _, (column, row) = cv2.minMaxLoc(votes)
         votes[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5] = -np.inf
-        found.append(low + CELL * (np.array([column, row]) + 0.5))
+        found.append(low + cell * (np.array([column, row]) + 0.5))
     return found
 
 
@@ -334,11 +320,12 @@ def _around(edges: _Edges, moved: _Edges, centre: Points, back: np.ndarray) -> l
         back: matrix that takes points of the stretched image back, shape (2, 2).
     """
     smallest, largest = MIN_RADIUS * min(edges.shape), MAX_RADIUS * min(edges.shape)
+    ratio = 1.03  # of the radii of a ring
     offset = moved.points - centre
     away = np.hypot(*offset.T)
     facing = np.abs((offset * moved.normals).sum(axis=1)) > ALIGNMENT * away
-    rings = (np.log(np.maximum(away, 1e-9) / smallest) / math.log(RING)).astype(int)
-    marks = np.zeros((int(math.log(largest / smallest) / math.log(RING)) + 2, BINS), np.bool_)
+    rings = (np.log(np.maximum(away, 1e-9) / smallest) / math.log(ratio)).astype(int)
+    marks = np.zeros((int(math.log(largest / smallest) / math.log(ratio)) + 2, BINS), np.bool_)
     inside = facing & (away >= smallest) & (rings < len(marks))
     marks[rings[inside], _sectors(offset[inside])] = True
     spread = marks.copy()  # An ellipse is no circle: it lies in several rings.
@@ -352,7 +339,7 @@ def _around(edges: _Edges, moved: _Edges, centre: Points, back: np.ndarray) -> l
         if support[ring] < 0.35 * BINS:
             break
         support[max(0, ring - 4) : ring + 5] = 0
-        radius = smallest * RING ** (ring + 0.5)
+        radius = smallest * ratio ** (ring + 0.5)
         some = np.flatnonzero(facing & (np.abs(away - radius) < 0.14 * radius))
         points = _through(offset[some[:: 1 + len(some) // 300]], max(0.8, AGREEMENT * radius))
         ellipse = _fitted((centre + points) @ back) if points is not None else None
@@ -372,7 +359,7 @@ def _sectors(offsets: Points) -> np.ndarray:
 
 def _support(edges: _Edges, ellipse: Ellipse) -> tuple[float, float]:
     """Return in which share of the directions in the frame edges agree with an ellipse, and the share in the frame."""
-    inside = _within(ellipse.points(BINS)[0], edges.shape)
+    inside = ellipse.seen(edges.shape, BINS)
     at = ellipse.coordinates(edges.points)
     normal = at / (ellipse.minor, ellipse.major)
     facing = np.abs((normal * (edges.normals @ ellipse.axes.T)).sum(axis=1)) > ALIGNMENT * np.hypot(*normal.T)
@@ -396,16 +383,12 @@ def _through(offsets: Points, tolerance: float) -> Points | None:
     """
     if len(offsets) < 20:
         return None
-    basis, radii, sectors = (
-        _harmonics(np.arctan2(offsets[:, 1], offsets[:, 0])),
-        np.hypot(*offsets.T),
-        _sectors(offsets),
-    )
+    basis, radii = _harmonics(np.arctan2(offsets[:, 1], offsets[:, 0])), np.hypot(*offsets.T)
+    sectors = _sectors(offsets)
     picked = np.random.default_rng(0).integers(0, len(offsets), (1000, 5))
     spread = np.diff(np.sort(sectors[picked], axis=1), axis=1).min(axis=1) > 2  # directions apart
     picked = picked[spread][:400]
-    systems = basis[picked]
-    picked = picked[np.abs(np.linalg.det(systems)) > 1e-3]
+    picked = picked[np.abs(np.linalg.det(basis[picked])) > 1e-3]
     shapes = np.linalg.solve(basis[picked], radii[picked][..., None])[..., 0]
     eccentric, flat = np.hypot(shapes[:, 1], shapes[:, 2]), np.hypot(shapes[:, 3], shapes[:, 4])
     shapes = shapes[(eccentric < 0.2 * shapes[:, 0]) & (flat < 0.12 * shapes[:, 0])]
@@ -421,9 +404,8 @@ def _through(offsets: Points, tolerance: float) -> Points | None:
 
 def _harmonics(turns: np.ndarray) -> np.ndarray:
     """Return the functions of `_through` at some angles, shape (m, 5)."""
-    return np.column_stack(
-        [np.ones_like(turns), np.cos(turns), np.sin(turns), np.cos(2.0 * turns), np.sin(2.0 * turns)]
-    )
+    waves = np.cos(turns), np.sin(turns), np.cos(2.0 * turns), np.sin(2.0 * turns)
+    return np.column_stack([np.ones_like(turns), *waves])
 
 
 def _fitted(points: Points) -> Ellipse | None:
@@ -433,7 +415,8 @@ def _fitted(points: Points) -> Ellipse | None:
     mean = points.mean(axis=0)
     (u, v), axes, angle = cv2.fitEllipseDirect((points - mean).astype(np.float32))
     minor, major = 0.5 * min(axes), 0.5 * max(axes)
-    if not (np.isfinite([u, v, minor, major]).all() and major > 1.0 and minor > MIN_RATIO * major):
+    # A camera tilted by more than 45 degrees is none.
+    if not (np.isfinite([u, v, minor, major]).all() and major > 1.0 and minor > 0.7 * major):
         return None
     direction = math.radians(angle) + (0.0 if axes[0] <= axes[1] else 0.5 * math.pi)
     return Ellipse((float(u + mean[0]), float(v + mean[1])), major, minor, direction)
@@ -468,11 +451,11 @@ def perspective(tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndar
     Args:
         tail: p, shape (2,) [m].
         heading: h, shape (2,).
-        radius: R of the dish [m], the share `NEAR` of d.
+        radius: R of the dish [m], a tenth of d at most; more is hardly used over a dish.
     """
     aside = np.array([-heading[1], heading[0]])
     moved = np.outer(tail, tail) - radius**2 * np.eye(2)
-    return np.vstack([moved, float(tail @ aside) * heading]) * (NEAR / radius)
+    return np.vstack([moved, float(tail @ aside) * heading]) * (0.1 / radius)
 
 
 def unseen_tilt_covariance(tail: np.ndarray, heading: np.ndarray, angle: float, radius: float) -> np.ndarray:
@@ -574,12 +557,9 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
     rings = find_rings(image)
     if not rings:
         return None
-    if settings.rim != "outer":
-        for dark_field in (False, True):
-            found = _by_wall(gray, rings, settings, diameter, dark_field)
-            if found is not None:
-                return _with_given(found, settings)
-    return _with_given(_by_ring(gray, rings, settings, diameter), settings)
+    ways = () if settings.rim == "outer" else (False, True)
+    by_wall = filter(None, (_by_wall(gray, rings, settings, diameter, dark_field) for dark_field in ways))
+    return _with_given(next(by_wall, None) or _by_ring(gray, rings, settings, diameter), settings)
 
 
 def _by_wall(
@@ -591,7 +571,7 @@ def _by_wall(
     and the tilt. All other rings lie at the wall, and beyond it the ground is bright again: a clear dish on a dark
     bench looks the same from the inside.
     """
-    light, guess = (255 - gray if dark_field else gray), inner_ring(rings)
+    light, guess = (255 - gray if dark_field else gray), rings[0].ellipse
     centre, radius = guess.centre_px, 0.5 * (guess.major + guess.minor)
     edges, darkest, count = np.empty((0, 2)), np.empty((0, 2)), 0
     for reach, step in ((0.12, 1.0), (0.04, 0.5)):  # in shares of the radius: by a first guess, and once it is known
@@ -601,10 +581,12 @@ def _by_wall(
             return None
         centre, radius, count = circle[:2], circle[2], circle[3]
     inner, ring = Ellipse(centre, radius, radius, 0.0), fit_circle(darkest, 0.5 * AGREEMENT_PX)
-    seen, (oval, spread) = _within(inner.points(RAYS)[0], gray.shape), _oval_of(darkest, inner)
+    seen, oval = inner.seen(gray.shape, RAYS), fitted_robustly(darkest, inner) or inner
+    spread = np.hypot(*oval.coordinates(darkest).T) - 1.0
+    spread = spread[np.abs(spread) < FINE_AGREEMENT]
     needed = SUPPORT * seen.sum()
     shares, farthest = [each.ellipse.major / radius for each in rings], 1.0 + 2.0 * WALL / diameter
-    beyond = Ellipse(centre, farthest * radius, farthest * radius, 0.0).points(RAYS)[0]
+    beyond = replace(inner, major=farthest * radius, minor=farthest * radius).at(unit_vectors(RAYS))
     beyond = beyond[_within(beyond, gray.shape)]
     if max(count, len(spread)) < needed or seen.mean() < 0.4 or not len(darkest) or not len(beyond):
         return None
@@ -633,25 +615,16 @@ def _by_wall(
     return FoundDish(view, dark_field, None, error, unseen)
 
 
-def _oval_of(points: Points, circle: Ellipse) -> tuple[Ellipse, np.ndarray]:
-    """Return the ellipse of most points near a circle, or the circle, and how far off those lie, as shares of it."""
-    oval = fitted_robustly(points, circle) or circle
-    apart = np.hypot(*oval.coordinates(points).T) - 1.0
-    return oval, apart[np.abs(apart) < FINE_AGREEMENT]
-
-
-def _doubt(rings: list[Ring], radius: float, settings: VisionTrackerSettings, diameter: float) -> float:
-    """Return the doubt of a scale by a ring of a radius [px]: that of another ring, if the user names none."""
-    if len(rings) == 1:
-        return max(RING_ERROR, WALL / diameter)
-    return max(RING_ERROR, *(abs(ring.ellipse.major / radius - 1.0) for ring in rings if not settings.rim), 0.0)
-
-
 def _by_ring(gray: Gray, rings: list[Ring], settings: VisionTrackerSettings, diameter: float) -> FoundDish:
     """Return the dish by one of its rings; where none was named, all of them make the doubt of the scale."""
-    edge = inner_ring(rings, outer=settings.rim == "outer")
-    error, tilt, radius, unseen = _doubt(rings, edge.major, settings, diameter), tilt_of(edge), edge.major, MIN_ANGLE
-    is_cut = not _within(edge.points(RAYS)[0], gray.shape).all()
+    edge = rings[-1 if settings.rim == "outer" else 0].ellipse
+    tilt, radius, unseen = tilt_of(edge), edge.major, MIN_ANGLE
+    error = RING_ERROR
+    if len(rings) == 1:
+        error = max(error, WALL / diameter)
+    elif not settings.rim:
+        error = max(error, *(abs(ring.ellipse.major / radius - 1.0) for ring in rings))
+    is_cut = not edge.seen(gray.shape, RAYS).all()
     if tilt is not None and (is_cut or not _is_confirmed(tilt, radius, rings)):
         # One edge that is no circle may be a tilted one, or two edges of which each is seen in a part.
         radius, unseen = 0.5 * (edge.major + edge.minor), max(tilt.angle, CUT_TILT if is_cut else 0.0)
@@ -719,11 +692,6 @@ class DishWatch:
         """Where the dish is; None if it was not found yet."""
         return self._fixed or (self.found.view if self.found is not None else None)
 
-    @property
-    def scale_error(self) -> float:
-        """Standard deviation of the view's scale, as a share; see `FoundDish`."""
-        return self.found.scale_error if self.found is not None else 0.0
-
     def look(self, image: np.ndarray) -> tuple[str, np.ndarray]:
         """Look at the rim in a frame.
 
@@ -743,22 +711,19 @@ class DishWatch:
         prepared = self.found.prepared(image)
         view = self.found.view
         shift, rays = rim_shift(prepared, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
+        before, self._anew = self._anew, []
         if rays >= 0.4 * BINS and shift < 1.0:  # px
-            self._anew = []
             return "", prepared
         found = see_dish(image, self._settings, self._diameter)
         if found is None:
-            self._anew = []
             return "too little of the dish is seen: uncover its rim, or give its view", prepared
         if self._agree(found, self.found):  # A rim that is not dark is seen by its ellipse only.
-            self._anew = []
             return "", prepared
-        if self._anew and not self._agree(found, self._anew[-1]):
-            self._anew = []
-        self._anew.append(found)
-        if len(self._anew) < 3:  # frames in a row that must agree on a new view
+        anew = [*before, found] if before and self._agree(found, before[-1]) else [found]
+        if len(anew) < 3:  # frames in a row that must agree on a new view
+            self._anew = anew
             return "the dish is not where it was", prepared
-        self.found, self._anew = found, []
+        self.found = found
         return "", found.prepared(image)
 
     def _agree(self, one: FoundDish, other: FoundDish) -> bool:

@@ -27,20 +27,14 @@ from magnetosuture_thread.vision.template import (
     tail_shift,
 )
 
-AROUND_PX, TAIL_REACH = 12.0, 0.2  # around a candidate, that is measured on, beside this share of its length
 MAX_COST = 0.11  # of the length, in squared pixels, of what is no needle
 HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
 CLEARLY = 1.25  # times the cost that the other way has if both could be
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 MAX_MISSING_END, END_ROWS = 0.15, 3  # share of steel that the image may lack at an end, and its rows
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
-BLUNT, MAX_BLUNT = 0.7, 1.2  # bluntness of a tail; where there is more, what is dark beside it is not of the needle
-MAX_TIP_SIDE = 0.6  # bluntness of a point on its blunter side, where a rod fits nearly as well
-TIP_BEYOND = 0.035  # of the length, by which a ground point reaches farther than the rod that answers best
-ALIKE = 1.1  # times the cost that a rod has where a reflection may make its end look like a point
-MAX_TRIES = 3  # fits of a dark thing that are looked at in full, the best first
+BLUNT = 0.7  # bluntness of a tail
 INSIDE = "inside of a shape of the scene"
-BEND_ERROR = 0.2  # rad; of the bend of a drawn needle that fits
 NO_SHAPE = "no needle's shape"
 
 
@@ -69,7 +63,8 @@ def find_needles(
     tries = Counter[int]()
     for fit, steel, thing in sorted(fits, key=lambda each: each[0].cost):
         arc = fit.arc.shifted(steel.origin)
-        if thing in needles or tries[thing] == MAX_TRIES or any(_lies_on(one, arc, size) for one in needles.values()):
+        # Of a dark thing the best three fits are looked at in full.
+        if thing in needles or tries[thing] == 3 or any(_lies_on(one, arc, size) for one in needles.values()):
             continue
         tries[thing] += 1
         found = _measured(picture, steel, fit, size, toward)
@@ -85,7 +80,9 @@ def find_needles(
         return list(needles.values()), refused
     if picture.mask is not None and _is_inside(picture.mask, axis, size.width_px):
         return [], [*refused, INSIDE]
-    return [axis.undirected() if toward is None else axis.pointing(toward)], refused
+    if toward is None:
+        return [axis.undirected()], refused
+    return [axis if axis.middle_direction_px @ toward > 0.0 else axis.reversed()], refused
 
 
 def _axis_alone(candidate: Candidate, size: NeedleSize) -> MeasuredNeedle:
@@ -115,7 +112,8 @@ def _rough_fits(steel: SteelMap, candidate: Candidate, size: NeedleSize) -> list
     slides = [0.0, *[-slack] * behind, *[slack] * ahead]
     axes = [own.moved(slide, 0.0, 0.0, 0.0) for slide in slides]
     ways = [way for axis in axes for way in (axis, axis.reversed_at(length))]
-    ways += [way.moved(TIP_BEYOND * length, 0.0, 0.0, 0.0) for way in ways[:2]]
+    # A ground point reaches farther than the rod that answers best.
+    ways += [way.moved(0.035 * length, 0.0, 0.0, 0.0) for way in ways[:2]]
     return [fit_template(steel, way, length, size.width_px, rounds=FIRST_ROUNDS) for way in ways]
 
 
@@ -129,7 +127,7 @@ def _steel_at(picture: Picture, arc: Arc, size: NeedleSize) -> SteelMap:
     """Return how much of each pixel around an axis is steel, with nothing known beyond the wall and in shapes."""
     along, aside = size.length_px / 47.0 * np.arange(48.0), np.array([-0.25, 0.0, 0.25]) * size.width_px
     points = arc.at(np.tile(along, len(aside)), np.repeat(aside, len(along)))
-    steel = SteelMap.around(points, picture, AROUND_PX + TAIL_REACH * size.length_px)
+    steel = SteelMap.around(points, picture, 12.0 + 0.2 * size.length_px)  # px
     steel = steel.hidden_where(picture.wall.beyond(steel.box, RIM_PX))
     if picture.mask is not None:
         steel = steel.hidden_where(picture.mask.depth[steel.box] > picture.mask.tolerance_px)
@@ -206,7 +204,7 @@ def _checked(steel: SteelMap, guess: Arc, size: NeedleSize, toward: np.ndarray |
         return reason
     if steel.share_hidden(best.arc, best.length) > 0.02:
         return "hidden"
-    if abs(best.arc.curvature) * best.length > size.max_bend + BEND_ERROR:
+    if abs(best.arc.curvature) * best.length > size.max_bend + 0.2:  # rad; error of a drawn needle's bend
         return "bent too far"
     excess = _excess(steel.surely, best, width)
     if excess[2] > 0.1:  # of the rows
@@ -217,10 +215,10 @@ def _checked(steel: SteelMap, guess: Arc, size: NeedleSize, toward: np.ndarray |
     # Where a rod fits clearly better, what makes an end look pointed is of something else.
     is_told_blunt = size.is_blunt or is_rod or CLEARLY * as_rod < pointed.cost
     fit = None if is_told_blunt else _pointed_way(steel, one, other)
-    if fit is not None and as_rod < ALIKE * fit.cost:
+    if fit is not None and as_rod < 1.1 * fit.cost:
         # A corner of a rod that a mark, the lamp or the wall takes; of a point with a thread over it a rod fits worse.
         is_doubtful = steel.is_glaring(fit.arc.at(np.array([0.0, fit.length])))
-        looks_blunt = as_rod < fit.cost and _bluntness(steel.perhaps, fit)[1].max() > MAX_TIP_SIDE
+        looks_blunt = as_rod < fit.cost and _bluntness(steel.perhaps, fit)[1].max() > 0.6  # of a tip's blunter side
         fit = None if is_doubtful or looks_blunt else fit
     is_clear = is_rod or max(one.cost, other.cost) > CLEARLY * pointed.cost
     if fit is None:
@@ -260,7 +258,7 @@ def _fits(
 ) -> tuple[TemplateFit, TemplateFit, TemplateFit]:
     """Fit a pointed needle, the same the other way round, and a rod."""
     length, width = size.length_px, size.width_px
-    one = fit_template(steel, guess, length, width, tolerance=tolerance, start=length)
+    one = fit_template(steel, guess, length, width, tolerance=tolerance)
     bound = HOPELESS * one.cost
     other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length, hopeless=bound)
     rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True, hopeless=bound)
@@ -298,7 +296,7 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if fit.cost > CLEARLY * against.cost:
             continue
         tail, tip = _bluntness(steel.perhaps, fit).min(axis=1).tolist()  # where a coloured thread may hide steel
-        if not BLUNT < tail < MAX_BLUNT or tip > 0.45:
+        if not BLUNT < tail < 1.2 or tip > 0.45:  # Where a tail is blunter, what is dark beside it is something else.
             continue
         their_tail, their_tip = _bluntness(steel.perhaps, against).min(axis=1).tolist()
         signs = (their_tail < 0.5) + (their_tip > 0.6)

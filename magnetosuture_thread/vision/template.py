@@ -22,8 +22,7 @@ from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, co
 from magnetosuture_thread.vision.arc import Arc
 from magnetosuture_thread.vision.images import NEXT, Layer, Picture, greatest_near, nearest
 
-GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
-GLARE_REACH_PX = 4  # around a place, that it is looked for, and over which it fades
+GLARE, GLARE_REACH_PX = 0.07, 4  # of the floor's light that a reflection is brighter by, fading over a reach
 SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
 TAPER = 0.2  # of the length, towards the tip
 BLUR_PX = 1.03  # of an edge, lens and sensor together
@@ -33,12 +32,10 @@ BESIDE_PX = 4.0  # beside and beyond the body, that is compared too
 STEP_PX = 0.75  # between samples across; along it is 1 px
 OTHER = 0.2  # of steel, at which dark beyond the drawn needle counts a quarter of steel that is missing
 BLOOM_PX = 0.22  # that shadow and lens let an edge seem to lie outside of where it is
-MAX_STEP_PX = 1.5  # of a round
 FIRST_ROUNDS = 4  # that tell which of several fits is worth more
-DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
 REACH_PX, LEVEL_PX = 4.5, 2.0  # to both sides of the end; from where on, two deviations of the blur, its step is over
-EDGE_STEP_PX, SIDE_PX = 0.25, 0.5  # between samples along the axis, and between lines
+EDGE_STEP_PX = 0.25  # between samples along the axis
 MAX_SHIFT_PX = 1.0  # from where the end is drawn; beyond, and where lines differ more, something hides it
 
 
@@ -89,8 +86,8 @@ class SteelMap:
     def unknown_in_glare(self) -> SteelMap:
         """Return the map in which steel may be anywhere that the lamp is reflected, and at the reflection's edge."""
         glare = (self.light > GLARE).astype(np.uint8)
-        size = 2 * GLARE_REACH_PX + 1
-        covered = cv2.dilate(glare, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
+        sides = (2 * GLARE_REACH_PX + 1,) * 2
+        covered = cv2.dilate(glare, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, sides)) > 0
         return replace(self, perhaps=np.where(covered, np.float32(1.0), self.perhaps)) if covered.any() else self
 
     @property
@@ -159,7 +156,9 @@ class TemplateFit:
         # The lens' blur makes the errors of three rows one and the same; a thread beside the needle pulls all rows to
         # one side, which is 3.5 times the variance by noise alone.
         inverse = np.linalg.inv(self.normal) * 3.5 * 3.0 * self.cost / self.samples
-        covariance = _at_tail(inverse, 0.5 * self.length)
+        middle = 0.5 * self.length  # to which the normal equations' place, angle and bend belong
+        turn = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, -middle, middle**2 / 3.0], [0.0, 0.0, 1.0, -middle]])
+        covariance = turn @ inverse[:4, :4] @ turn.T
         lengthwise = np.array([1.0, 0.0, self.arc.curvature])
         # What no fit's residual tells of: 0.1 px aside, 0.15 degrees and 0.27 px along are most likely for the errors
         # over hundreds of simulated poses, needles and sizes of images.
@@ -207,12 +206,6 @@ def fit_template(
     cost, count = _fit(steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, hopeless, normal)
     arc, fitted = Arc(state[:2].copy(), float(state[2]), float(state[3])), float(state[5])
     return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, normal, count, thin)
-
-
-def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
-    """Return the covariance of tail and angle there, by that of place, angle and curvature in the middle."""
-    turn = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, -middle, middle**2 / 3.0], [0.0, 0.0, 1.0, -middle]])
-    return np.asarray(turn @ inverse[:4, :4] @ turn.T)
 
 
 @compiled_inline
@@ -284,38 +277,17 @@ def _draw_needle(along, aside, length, half, bloom, thin, drawn, wider, longer):
 
 
 @compiled_inner
-def _add_row(own, right, turned, bent, shape, end, rest):
-    """Add a row's sums to the lower half of the normal equations; slopes by angle and bend are multiples of b."""
-    aa, ab, bb, aw, bw, ww = shape
-    own[0, 0] += aa
-    own[1, 0] += ab
-    own[2, 0] += turned * ab
-    own[3, 0] += bent * ab
-    own[4, 0] += aw
-    own[1, 1] += bb
-    own[2, 1] += turned * bb
-    own[3, 1] += bent * bb
-    own[4, 1] += bw
-    own[2, 2] += turned * turned * bb
-    own[3, 2] += turned * bent * bb
-    own[4, 2] += turned * bw
-    own[3, 3] += bent * bent * bb
-    own[4, 3] += bent * bw
-    own[4, 4] += ww
-    ae, be, we, ee = end
-    own[5, 0] += ae
-    own[5, 1] += be
-    own[5, 2] += turned * be
-    own[5, 3] += bent * be
-    own[5, 4] += we
-    own[5, 5] += ee
-    ra, rb, rw, re = rest
-    right[0] += ra
-    right[1] += rb
-    right[2] += turned * rb
-    right[3] += bent * rb
-    right[4] += rw
-    right[5] += re
+def _add_row(own, right, turned, bent, sums, rest):
+    """Add a row's sums to the lower half of the normal equations.
+
+    The sums are of products of the four slopes, along, aside, by the width and by the length; those by the angle and by
+    the bend are multiples of the one aside.
+    """
+    slopes, factors = (0, 1, 1, 1, 2, 3), (1.0, 1.0, turned, bent, 1.0, 1.0)
+    for i in range(PARAMETERS):
+        right[i] += factors[i] * rest[slopes[i]]
+        for j in range(i + 1):
+            own[i, j] += factors[i] * factors[j] * sums[slopes[i]][slopes[j]]
 
 
 @compiled
@@ -450,7 +422,8 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
                     re -= weight * e * apart
             t = along[row] - middle
             turned, bent = t, 0.5 * (t * t - middle * middle / 3.0)  # times b: slopes by the angle and by the bend
-            _add_row(own, right, turned, bent, (aa, ab, bb, aw, bw, ww), (ae, be, we, ee), (ra, rb, rw, re))
+            sums = (aa, ab, aw, ae), (ab, bb, bw, be), (aw, bw, ww, we), (ae, be, we, ee)
+            _add_row(own, right, turned, bent, sums, (ra, rb, rw, re))
         for i in range(PARAMETERS):
             right[i] *= STEP_PX
             for j in range(i + 1):
@@ -460,10 +433,11 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         right[4] -= prior * (bloom - BLOOM_PX)
         own[5, 5] += length_prior
         right[5] -= length_prior * (own_length - length) if free else 0.0
-        own[0, 0] += DAMPING
-        own[1, 1] += DAMPING
-        own[2, 2] += DAMPING * middle**2 / 3.0
-        own[3, 3] += DAMPING * middle**4 / 45.0
+        damping = 0.05  # of places along and aside, that of all others accordingly
+        own[0, 0] += damping
+        own[1, 1] += damping
+        own[2, 2] += damping * middle**2 / 3.0
+        own[3, 3] += damping * middle**4 / 45.0
         cost = cost * STEP_PX + prior * (bloom - BLOOM_PX) ** 2
         if free:
             cost += length_prior * (own_length - length) ** 2
@@ -479,8 +453,7 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         _solve(own, right, change)
         largest = max(abs(change[0]), abs(change[1]), abs(change[2]) * middle, abs(change[3]) * 0.5 * middle * middle)
         largest = max(largest, abs(change[5]))
-        if largest > MAX_STEP_PX:
-            change *= MAX_STEP_PX / largest
+        change *= min(1.0, 1.5 / largest)  # px, of a round
         # What the middle is turned and bent by moves the tail, where the arc begins.
         shift = change[1] - change[2] * middle + change[3] * middle * middle / 3.0
         angle = state[2]
@@ -509,8 +482,8 @@ def tail_shift(steel: SteelMap, fit: TemplateFit) -> float | None:
     if steel.is_glaring(fit.arc.at(np.array([-REACH_PX, 0.0]))):
         return None
     along = np.arange(-REACH_PX - MAX_SHIFT_PX, REACH_PX + MAX_SHIFT_PX + 0.5 * EDGE_STEP_PX, EDGE_STEP_PX)
-    count = max(1, int(0.5 * fit.width / SIDE_PX))
-    dark = fit.arc.strip(steel.dark, along, SIDE_PX * np.arange(-count, count + 1))
+    count = max(1, int(fit.width))  # lines every half a pixel to each side
+    dark = fit.arc.strip(steel.dark, along, 0.5 * np.arange(-count, count + 1))
     shift = float(_shift_of(along, dark, steel.depth))
     return None if math.isnan(shift) else shift
 

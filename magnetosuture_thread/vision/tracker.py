@@ -20,7 +20,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_a
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.vision.arc import Arc, LengthEstimator, MeasuredNeedle
+from magnetosuture_thread.vision.arc import SET_TOLERANCE, Arc, LengthEstimator, MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.candidates import Prior
 from magnetosuture_thread.vision.centreline import find_centreline, without_needle
 from magnetosuture_thread.vision.dish import DishWatch, FoundDish
@@ -40,16 +40,10 @@ from magnetosuture_thread.vision.observe import observe
 from magnetosuture_thread.vision.settings import VisionTrackerSettings, scaled_homography
 from magnetosuture_thread.vision.walk import Ridge, smoothed, walk_on, worth
 
-SMOOTHING = 0.5  # weight of the newest velocity
-VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 UNDIRECTED = "the needle's axis is found, but not which end is the tip: click it on the page, or by --tip or needle/tip"
 NO_NEEDLE = "no needle in the dish"
-TIP_REACH = 1.0 / 3.0  # of the length, from a point that a person gives: the other end is then twice as far or more
 TIP_LOST = "the point at the tip is too old, or farther from the needle's ends than a third of its length: point again"
-CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
-SEARCH_PERIOD = 0.25  # s between frames of which all is searched for a thread that seems cut; it takes a frame's time
 REPEATED = "camera repeats frames"
-MAX_CYCLE = 100  # frames; after more of them a repetition is not found
 
 
 class State(Enum):
@@ -68,6 +62,7 @@ class Track:
         state: TRACKED when there is a pose; LOST when this frame gives none; SEARCHING while the needle is
             found anew, or seen but not yet often enough.
         reason: why there is no pose, or why its heading is unknown; empty when tracked.
+        view: where the dish is in the image; None when it is not found.
         confidence: of the pose, 0 to 1; 0 without one.
         tail: the needle's blunt end, shape (2,) [m]; either end where the heading is unknown, empty without an axis.
         tip: its point, shape (2,) [m]; the other end.
@@ -77,7 +72,6 @@ class Track:
             end is the tail, the state is not TRACKED, the variance of the angle is pi^2, and that along the needle its
             length squared.
         centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
-        view: where the dish is in the image; None when it is not found.
         warning: what makes the measurement worse than it could be; empty if nothing does.
         needle_length: measured over the first frames [m]; None until it is, and of a frame looked at alone.
         observation: the pieces of the thread that are seen, in the dish frame.
@@ -87,15 +81,15 @@ class Track:
     """
 
     state: State
-    reason: str
-    confidence: float
-    tail: np.ndarray
-    tip: np.ndarray
-    heading: np.ndarray
-    curvature: float
-    covariance: np.ndarray
-    centreline: np.ndarray
-    view: DishView | None
+    reason: str = ""
+    view: DishView | None = None
+    confidence: float = 0.0
+    tail: np.ndarray = field(default_factory=lambda: np.empty(0))
+    tip: np.ndarray = field(default_factory=lambda: np.empty(0))
+    heading: np.ndarray = field(default_factory=lambda: np.empty(0))
+    curvature: float = 0.0
+    covariance: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    centreline: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     warning: str = ""
     needle_length: float | None = None
     observation: ThreadObservation = field(default_factory=ThreadObservation)
@@ -121,12 +115,6 @@ class Track:
 
 
 PoseCallback = Callable[[Track], None]
-
-
-def no_pose(state: State, reason: str, view: DishView | None) -> Track:
-    """Return what is said of a frame without a pose."""
-    nothing = np.empty(0)
-    return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
 
 
 def _in_dish(needle: MeasuredNeedle, view: DishView) -> np.ndarray:
@@ -275,21 +263,22 @@ class VisionTracker:
             problem = self._lens.problem_with(image.shape)
             small = self._lens.undistorted(small, self._factor) if problem is None else small
         left, top, right, bottom = self._region_px
-        found = self._track(np.ascontiguousarray(small[top:bottom, left:right]), time_s, on_pose)
-        dish = self._dish.found.warning if self._dish.found is not None else ""
+        track = self._track(np.ascontiguousarray(small[top:bottom, left:right]), time_s, on_pose)
+        dish, view = self._dish.found, track.view
         lens = f"{problem}; it is not used" if problem is not None else ""
-        warning, self._tip_loss = "; ".join(filter(None, (dish, lens, self._tip_loss))), ""
-        found = replace(found, warning=warning, needle_length=self._length.length, scale_error=self._dish.scale_error)
-        if found.view is None:
-            return found
-        u, v = found.view.centre_px
-        view = replace(found.view, centre_px=(u + left, v + top)).shrunk(1.0 / self._factor)
-        if (ring := self._dish.found) is None:
-            return replace(found, view=view)
-        straight = ring.straightening()
+        warning = "; ".join(filter(None, (dish.warning if dish is not None else "", lens, self._tip_loss)))
+        self._tip_loss = ""
+        track = replace(track, warning=warning, needle_length=self._length.length)
+        if view is not None:
+            u, v = view.centre_px
+            view = replace(view, centre_px=(u + left, v + top)).shrunk(1.0 / self._factor)
+        if dish is None:
+            return replace(track, view=view)
+        straight = dish.straightening()
         if straight is not None:
             straight = scaled_homography(scaled_homography(straight, 1.0, -left, -top), 1.0 / self._factor)
-        return replace(found, view=view, straightening=straight, dark_field=ring.dark_field)
+        error, dark_field = dish.scale_error, dish.dark_field
+        return replace(track, view=view, scale_error=error, straightening=straight, dark_field=dark_field)
 
     def _track(self, image: np.ndarray, time_s: float, on_pose: PoseCallback | None) -> Track:
         """Look at the next frame, shrunk."""
@@ -300,22 +289,22 @@ class VisionTracker:
         view = self._dish.view
         if reason or view is None:
             self._anew = []
-            return no_pose(self._missing(), reason, view)
+            return Track(self._missing(), reason, view)
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
         needle, picture, whole, reason = self._choose(image, time_s)
         if needle is None or picture is None:
-            return no_pose(self._missing(), reason, view)
+            return Track(self._missing(), reason, view)
         pose = self._pose_of(needle, picture.view)
         if on_pose is not None:
             on_pose(pose)
         line, observation = self._measured(picture, needle, search=whole)
-        searches = whole
-        if not whole and time_s - self._searched >= SEARCH_PERIOD and self._is_cut(needle, line, observation, picture):
-            searches, complete = True, self._picture(image)
+        # To search all of a frame for a thread that seems cut takes a frame's time: every 0.25 s is enough.
+        if not whole and time_s - self._searched >= 0.25 and self._is_cut(needle, line, observation, picture):
+            whole, complete = True, self._picture(image)
             needle = needle.shifted(np.subtract(complete.view.centre_px, picture.view.centre_px))
             line, observation = self._measured(complete, needle, search=True)
-        if searches:
+        if whole:
             self._searched = time_s
         if needle.size_measured:
             self._length.add((needle.length_px - needle.tail_shift_px) * view.metres_per_pixel, needle.confidence)
@@ -363,8 +352,9 @@ class VisionTracker:
 
         The view is rounded, so that the noise of a dish found in every frame anew makes no new mask.
         """
-        u, v = (round(value / VIEW_STEP_PX) * VIEW_STEP_PX for value in view.centre_px)
-        radius = round(self._scene.dish.radius / view.metres_per_pixel / VIEW_STEP_PX) * VIEW_STEP_PX
+        step = 0.5  # px; much less than the tolerance of outlines
+        u, v = (round(value / step) * step for value in view.centre_px)
+        radius = round(self._scene.dish.radius / view.metres_per_pixel / step) * step
         rounded = DishView((u, v), self._scene.dish.radius / radius, view.rotation)
         if self._mask[0] != (rounded, image.shape[:2]):
             mask = scene_mask(self._scene, rounded, image.shape[:2], self._settings.outline_tolerance)
@@ -374,19 +364,27 @@ class VisionTracker:
     def _choose(self, image: np.ndarray, time: float) -> tuple[MeasuredNeedle | None, Picture | None, bool, str]:
         """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
         view, last, settings = self._found_dish().view, self._last, self._settings
-        size = self._length.size(settings.needle_length, settings.needle_width, view.metres_per_pixel)
-        size = replace(size, max_brightness=settings.max_needle_brightness, max_bend=settings.max_needle_bend)
-        size = replace(size, is_blunt=settings.needle_is_blunt)
+        scale, measured = view.metres_per_pixel, self._length.length
+        length, tolerance = (settings.needle_length, SET_TOLERANCE) if measured is None else (measured, 0.02)
+        size = NeedleSize(
+            length / scale,
+            settings.needle_width / scale,
+            tolerance,
+            settings.max_needle_brightness,
+            settings.needle_is_blunt,
+            settings.max_needle_bend,
+        )
         for whole in (False, True) if last is not None else (True,):
             picture = self._picture(image, None if whole else self._region(image, view, time))
             toward = self._toward(view, time)
             prior = None if whole else self._prior(picture.view, size.length_px, time)
             needles, refused = find_needles(picture, size, toward, prior)
             needles = [self._proven(needle, picture) for needle in needles]
+            poses = [_pose(needle, picture, time) for needle in needles]
             if toward is None and (pointed := self._pointed_at(needles, picture, time)) is not None:
                 needles, _ = find_needles(picture, size, pointed.middle_direction_px)
                 needles = [each for each in needles if math.dist(each.tip_px, pointed.tip_px) < 0.5 * each.length_px]
-            elif toward is not None and whole and not self._near_before(needles, picture, time):
+            elif toward is not None and whole and not any(self._fits(each, self._before) for each in poses):
                 needles, refused = find_needles(picture, size, None)  # it is elsewhere, and may have turned round
                 needles = [self._proven(needle, picture) for needle in needles]
             needles = [self._as_before(needle, picture, time) for needle in needles]
@@ -436,10 +434,6 @@ class VisionTracker:
         """The last pose, or that which the next frames have to agree with; None without any."""
         return self._last or (self._anew[-1] if self._anew else None)
 
-    def _near_before(self, needles: list[MeasuredNeedle], picture: Picture, time: float) -> bool:
-        """Say whether any needle lies where the one before can be."""
-        return any(self._fits(_pose(needle, picture, time), self._before) for needle in needles)
-
     def _toward(self, view: DishView, time: float) -> Points | None:
         """Return where the needle's middle must point, u right and v down; None where it may have turned unseen."""
         before = self._before
@@ -457,7 +451,8 @@ class VisionTracker:
         place, until = self._tip
         tip = picture.view.to_pixels(place)
         ways = [way for needle in needles if not needle.heading_known for way in (needle, needle.reversed())]
-        near = [way for way in ways if math.dist(way.tip_px, tip) < TIP_REACH * way.length_px]
+        # The other end is then twice as far or more.
+        near = [way for way in ways if math.dist(way.tip_px, tip) < way.length_px / 3.0]
         if near and time <= until:
             self._is_pointed_at = True
             return min(near, key=lambda way: math.dist(way.tip_px, tip))
@@ -500,10 +495,8 @@ class VisionTracker:
             tail=tail,
             tip=view.to_dish(needle.tip_px),
             heading=heading,
-            curvature=-needle.curvature_px / view.metres_per_pixel,
+            curvature=-needle.arc.curvature / view.metres_per_pixel,
             covariance=_in_dish(needle, view) + dish.covariance(tail, heading, radius),
-            centreline=np.empty((0, 2)),
-            view=None,
         )
 
     def _measured(self, picture: Picture, needle: MeasuredNeedle, *, search: bool) -> tuple[Points, ThreadObservation]:
@@ -586,12 +579,12 @@ class VisionTracker:
 
         Between frames a moment apart, noise alone looks like any speed.
         """
-        velocity, turn_rate = np.zeros(2), 0.0
+        velocity, turn_rate, newest = np.zeros(2), 0.0, 0.5  # weight of the newest velocity
         if before is not None:
             after = pose.time - before.time
-            velocity = before.velocity + SMOOTHING * ((pose.tail - before.tail) / after - before.velocity)
+            velocity = before.velocity + newest * ((pose.tail - before.tail) / after - before.velocity)
             turned = math.remainder(pose.angle - before.angle, math.tau)
-            turn_rate = before.turn_rate + SMOOTHING * (turned / after - before.turn_rate)
+            turn_rate = before.turn_rate + newest * (turned / after - before.turn_rate)
             velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         direction_is_clear = pose.direction_is_clear or (before is not None and before.direction_is_clear)
@@ -634,12 +627,12 @@ def _pose(needle: MeasuredNeedle, picture: Picture, time: float) -> _Pose:
 class RepetitionDetector:
     """Finds frames that came before.
 
-    No sensor gives the same noise twice: a frame that is equal, bit for bit, to an earlier one of the last `MAX_CYCLE`
-    is not of this moment. Frames are compared by the hash of a sample of their pixels.
+    No sensor gives the same noise twice: a frame that is equal, bit for bit, to one of the last 100 is not of this
+    moment. Frames are compared by the hash of a sample of their pixels.
     """
 
     def __init__(self) -> None:
-        self._seen: deque[tuple[float, int]] = deque(maxlen=MAX_CYCLE)
+        self._seen: deque[tuple[float, int]] = deque(maxlen=100)
 
     def is_repeated(self, time_s: float, image: np.ndarray) -> bool:
         """Return whether a frame, taken at a time [s], was there before that time, and keep it."""
@@ -719,7 +712,7 @@ class TrackerSession:
         except InvalidInputError as error:
             return self.on_broken(error)
         if repeated and len(track.tail):
-            track = no_pose(self.missing, REPEATED, track.view)
+            track = Track(self.missing, REPEATED, track.view)
         self.frames += 1
         self.tracked += track.state is State.TRACKED
         return FrameMeasurement(track, published_centreline(track))
@@ -727,15 +720,15 @@ class TrackerSession:
     def on_broken(self, problem: InvalidInputError) -> FrameMeasurement:
         """Count a frame that cannot be looked at, and say why."""
         self.frames += 1
-        return FrameMeasurement(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)
+        return FrameMeasurement(Track(self.missing, str(problem)), np.empty((0, 2)), problem)
 
 
 def published_centreline(track: Track) -> Points:
-    """Return what is told of a centreline: `CENTRELINE_POINTS` vertices equally spaced, or none, shape (m, 2) [m]."""
+    """Return what is told of a centreline: 64 vertices equally spaced, or none, shape (m, 2) [m]."""
     if len(track.centreline) < 2:
         return np.empty((0, 2))
-    at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
-    return points_at(track.centreline, at)
+    # Each is a whole pose in the message.
+    return points_at(track.centreline, np.linspace(0.0, arc_lengths(track.centreline)[-1], 64))
 
 
 def warm_up() -> bool:

@@ -35,7 +35,7 @@ from magnetosuture_thread.thread.barriers import SelfContact
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.prediction import Prediction
-from magnetosuture_thread.vision.tracker import State, no_pose
+from magnetosuture_thread.vision.tracker import State, Track
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 from test.geometry.scene.scenes import every_shape
 from test.nodes import wire
@@ -124,8 +124,8 @@ PACKED = {
     "jpeg": (interface.COMPRESSED_IMAGE, packing.packed_compressed_image(7, np.arange(9, dtype=np.uint8))),
     "image": (interface.IMAGE, packing.packed_image(7, np.arange(24, dtype=np.uint8).reshape(2, 4, 3))),
     "camera": (interface.CAMERA_INFO, packing.packed_camera_info(7, (640, 480), VIEW, 0.3)),
-    "tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "glare", VIEW))),
-    "blind tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "", None))),
+    "tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, Track(State.LOST, "glare", VIEW))),
+    "blind tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, Track(State.LOST))),
     "observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, observation(3, 64))),
     "prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction((0, 3)), "silk")),
     "free prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction(), "")),
