@@ -7,7 +7,7 @@ the angle that it is bent by, as straight needles are more usual,
 
     D = 2 (1 - I / F) / (1 - b) - 1, from 0 to 1
 
-of an image I, its floor F, closed over what is narrower than `CLOSING`, and the brightness b that a needle has at most.
+of an image I, its floor F, closed over what is narrower than 2.4 widths, and the brightness b of a needle at most.
 A blob and an edge have about 0 by it, a line that goes on beyond both ends 0.5, and a rod 1, also where a thread
 as wide leaves one end.
 
@@ -29,21 +29,10 @@ from magnetosuture_thread.geometry.compiled import compiled, compiled_inner
 from magnetosuture_thread.vision.arc import Arc, NeedleSize
 from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall, sample
 
-COARSE_PX = 2.5  # width of the needle in the reduced picture
-MIN_SEED, MIN_SCORE = 0.3, 0.3  # of a part of a rod, and of a rod, that is looked at further
-MIN_INSIDE = 0.6  # darkness of what is a needle's and no thread's
-SURE_SCORE, UNIQUE = 0.65, 0.85  # of a needle by its score alone, a line half as wide has 0.6; share that another has
-MIN_FILLED = 0.4  # darkness of its first and its last quarter, of which a thing that is 15 % shorter leaves so much
+MIN_SCORE = 0.3  # of a rod, and of a part of one, that is looked at further
 DARK_END, GOES_ON = 0.2, 0.6  # darkness beyond an end, from which on something may go on there, and does
-SEED, MAX_SEED = 0.66, 0.7  # of the length: along which one bent by 1 rad is about straight; that is sought at once
-MAX_SEEDS, MAX_CANDIDATES = 96, 8
-MIN_SEEN = 0.7  # of a rod, that has to be in sight
-ROWS, TAPER = 0.4, 0.1  # widths between rows of samples; share of them at each end of which the middle alone counts
+TAPER = 0.1  # share of the rows of samples at each end, of which the middle alone counts
 BESIDE = (0.65, 1.1)  # widths from the axis to what is beside it
-BORDER = 4.0  # widths beyond a needle, as far as its floor and its ends are looked at
-CLOSING = 2.4  # widths, below which a dark thing is not taken for the floor
-LEAST_GAIN = 0.002  # of a score by climbing once more; noise of 2 grey levels over a rod makes as much
-FINEST_PX = 0.2  # step of a climb; noise moves its end by more
 UNKNOWN = 0  # darkness is 1 to 255 where it is known
 
 
@@ -87,12 +76,52 @@ class Prior:
 
 def find_candidates(picture: Picture, size: NeedleSize, prior: Prior | None = None) -> list[Candidate]:
     """Return where a needle of a size may be in a picture, the best first; all over it without a prior."""
+    offset = np.zeros(2, int)
     if prior is not None:
-        away = prior.reach + 0.5 * size.length_px + BORDER * size.width_px
+        away = prior.reach + 0.5 * size.length_px + 4.0 * size.width_px  # with its floor and what is beyond its ends
         picture, offset = _part(picture, prior.middle - away, prior.middle + away)
-        found = _search(picture, size, replace(prior, middle=prior.middle - offset))
-        return [replace(each, arc=each.arc.shifted(offset), origin=offset) for each in found]
-    return _search(picture, size, None)
+        prior = replace(prior, middle=prior.middle - offset)
+    if size.length_px > math.hypot(*picture.shape):
+        return []
+    dark, taper = darkness(picture, size), 0.0 if size.is_blunt else TAPER
+    factor = max(1, round(size.width_px / 2.5))  # px; width of the needle in the reduced picture
+    rows, columns = (side // factor * factor for side in dark.shape)
+    whole = dark[:rows, :columns]
+    coarse = np.asarray(cv2.resize(whole, (columns // factor, rows // factor), interpolation=cv2.INTER_AREA))
+    _, things = cv2.connectedComponents(cv2.threshold(coarse, 128, 255, cv2.THRESH_BINARY)[1])
+    length, width = size.length_px / factor, size.width_px / factor
+    angles = max(12, math.ceil(math.pi / (1.6 * width / length)))
+    bends = 2 * min(20, math.ceil(size.max_bend / (6.0 * width / length))) + 1
+    best, which = np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.int32)
+    # Along 0.66 of its length one bent by 1 rad is about straight; of other bends, where the sagitta is the same.
+    seed = min(0.7, 0.66 / math.sqrt(max(size.max_bend, 1e-6))) * length
+    region: tuple[float, ...] = (0.0, 0.0, math.hypot(*coarse.shape), 0.0, math.pi)
+    if prior is not None:
+        u, v = ((float(value) + 0.5) / factor - 0.5 for value in prior.middle)
+        region = (u, v, prior.reach / factor + 1.0, prior.angle, prior.turn + math.pi / angles)
+    _search_seeds(coarse, seed, width, angles, region, best, which)
+    rough: list[tuple[float, np.ndarray, int]] = []
+    for row, column in _peaks(best, max(1, round(0.1 * length))):
+        state = np.array([column, row, math.pi * which[row, column] / angles, 0.0])
+        score = _bend(coarse, state, length, width, size.max_bend, bends, taper)
+        scaled = [*((state[:2] + 0.5) * factor - 0.5), state[2], state[3] / factor]
+        rough.append((score, np.array(scaled), int(things[row, column])))
+    found = list[Candidate]()
+    for score, state, thing in sorted(rough, key=lambda each: -each[0]):
+        if score < MIN_SCORE or len(found) == 8:
+            break
+        if any(_is_same(state, other, size) for other in found):
+            continue
+        score = climb(dark, state, size.length_px, size.width_px, size.max_bend, taper)
+        u, v, angle, curvature = (float(value) for value in state)
+        inside, _, _, *ends = _answer(dark, u, v, angle, curvature, size.length_px, size.width_px, taper)
+        # A thread is not as dark inside.
+        if score > MIN_SCORE and inside > 0.6 and not any(_is_same(state, other, size) for other in found):
+            middle = Arc(np.array([u, v]), angle, curvature)
+            arc = middle.moved(-0.5 * size.length_px, 0.0, 0.0, 0.0)
+            found.append(Candidate(arc, score, thing, tuple(ends), dark, offset))
+    found.sort(key=lambda candidate: -candidate.score)
+    return [replace(each, arc=each.arc.shifted(offset)) for each in found]
 
 
 def _part(picture: Picture, low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Picture, NDArray[np.int_]]:
@@ -106,65 +135,18 @@ def _part(picture: Picture, low: NDArray[np.float64], high: NDArray[np.float64])
     return replace(picture, brightest=brightest, wall=wall, mask=mask), offset
 
 
-def _search(picture: Picture, size: NeedleSize, prior: Prior | None) -> list[Candidate]:
-    """Return the candidates of a picture."""
-    if size.length_px > math.hypot(*picture.shape):
-        return []
-    dark, taper = darkness(picture, size), 0.0 if size.is_blunt else TAPER
-    factor = max(1, round(size.width_px / COARSE_PX))
-    rows, columns = (side // factor * factor for side in dark.shape)
-    whole = dark[:rows, :columns]
-    coarse = np.asarray(cv2.resize(whole, (columns // factor, rows // factor), interpolation=cv2.INTER_AREA))
-    _, things = cv2.connectedComponents(cv2.threshold(coarse, 128, 255, cv2.THRESH_BINARY)[1])
-    length, width = size.length_px / factor, size.width_px / factor
-    angles = max(12, math.ceil(math.pi / (1.6 * width / length)))
-    bends = 2 * min(20, math.ceil(size.max_bend / (6.0 * width / length))) + 1
-    best, which = np.zeros(coarse.shape, np.float32), np.zeros(coarse.shape, np.int32)
-    seed = min(MAX_SEED, SEED / math.sqrt(max(size.max_bend, 1e-6))) * length  # whose sagitta is the same
-    region = _seed_region(coarse.shape, factor, prior, math.pi / angles)
-    _search_seeds(coarse, seed, width, angles, region, best, which)
-    rough: list[tuple[float, np.ndarray, int]] = []
-    for row, column in _peaks(best, max(1, round(0.1 * length))):
-        state = np.array([column, row, math.pi * which[row, column] / angles, 0.0])
-        score = _bend(coarse, state, length, width, size.max_bend, bends, taper)
-        scaled = [*((state[:2] + 0.5) * factor - 0.5), state[2], state[3] / factor]
-        rough.append((score, np.array(scaled), int(things[row, column])))
-    found = list[Candidate]()
-    for score, state, thing in sorted(rough, key=lambda each: -each[0]):
-        if score < MIN_SCORE or len(found) == MAX_CANDIDATES:
-            break
-        if any(_is_same(state, other, size) for other in found):
-            continue
-        score = climb(dark, state, size.length_px, size.width_px, size.max_bend, taper)
-        u, v, angle, curvature = (float(value) for value in state)
-        inside, _, _, *ends = _answer(dark, u, v, angle, curvature, size.length_px, size.width_px, taper)
-        if score > MIN_SCORE and inside > MIN_INSIDE and not any(_is_same(state, other, size) for other in found):
-            middle = Arc(np.array([u, v]), angle, curvature)
-            arc = middle.moved(-0.5 * size.length_px, 0.0, 0.0, 0.0)
-            found.append(Candidate(arc, score, thing, tuple(ends), dark, np.zeros(2, int)))
-    return sorted(found, key=lambda candidate: -candidate.score)
-
-
-def _seed_region(shape: tuple[int, ...], factor: int, prior: Prior | None, step: float) -> tuple[float, ...]:
-    """Return u, v and reach [px] of the seeds in a picture reduced by a factor, their angle and its tolerance [rad]."""
-    if prior is None:
-        return 0.0, 0.0, math.hypot(*shape), 0.0, math.pi
-    u, v = ((value + 0.5) / factor - 0.5 for value in prior.middle)
-    return float(u), float(v), prior.reach / factor + 1.0, prior.angle, prior.turn + step
-
-
 def _peaks(best: NDArray[np.float32], reach: int) -> NDArray[np.int_]:
     """Return row and column of the greatest scores within a reach [px], the best first, shape (n, 2).
 
     Along a rod that is all dark many are equal: those that are as far from each other count, from its middle on.
     """
     side = 2 * reach + 1
-    top = ((best >= cv2.dilate(best, np.ones((side, side), np.uint8))) & (best > MIN_SEED)).astype(np.uint8)
+    top = ((best >= cv2.dilate(best, np.ones((side, side), np.uint8))) & (best > MIN_SCORE)).astype(np.uint8)
     _, labels, _, centres = cv2.connectedComponentsWithStats(top)
     at = np.argwhere(top)
     apart = np.hypot(*(at - centres[labels[at[:, 0], at[:, 1]]][:, ::-1]).T)
     left, peaks = at[np.lexsort((apart, -best[at[:, 0], at[:, 1]]))], list[NDArray[np.int_]]()
-    while len(left) and len(peaks) < MAX_SEEDS:
+    while len(left) and len(peaks) < 96:
         peaks.append(left[0])
         left = left[np.abs(left - left[0]).max(axis=1) > reach]
     return np.array(peaks).reshape(-1, 2)
@@ -192,17 +174,18 @@ def is_unique(candidates: list[Candidate], wall: Wall, size: NeedleSize) -> bool
 
     At the wall it may be dark beyond an end.
     """
-    if not candidates or candidates[0].score < SURE_SCORE:
+    if not candidates or candidates[0].score < 0.65:  # A line half as wide has 0.6.
         return False
     first = candidates[0]
     own = first.arc.shifted(-first.origin)
-    if min(_filled_ends(first.dark, own, size)) < MIN_FILLED:
+    # A thing that is 15 % shorter leaves so much dark in a quarter.
+    if min(_filled_ends(first.dark, own, size)) < 0.4:
         return False
     ends = first.arc.at(np.array([0.0, size.length_px]))
     free = np.hypot(*(ends - wall.centre).T) < wall.radius - 2.0 * size.width_px
     if np.any(free & (np.maximum(_around_ends(first.dark, own, size), first.ends) > GOES_ON)):
         return False
-    return all(each.score < UNIQUE * first.score for each in candidates[1:])
+    return all(each.score < 0.85 * first.score for each in candidates[1:])
 
 
 def _is_same(state: np.ndarray, other: Candidate, size: NeedleSize) -> bool:
@@ -215,7 +198,7 @@ def _is_same(state: np.ndarray, other: Candidate, size: NeedleSize) -> bool:
 def darkness(picture: Picture, size: NeedleSize) -> NDArray[np.uint8]:
     """Return D of a picture, 1 for the floor to 255, and `UNKNOWN` beyond the wall and in shapes of the scene."""
     pixels, floor = picture.brightest.pixels, picture.brightest.floor
-    side = 2 * int(0.5 * CLOSING * size.width_px) + 1
+    side = 2 * int(0.5 * 2.4 * size.width_px) + 1  # widths, below which a dark thing is not taken for the floor
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     inside = picture.wall.inside(picture.shape, RIM_PX)
     shown = cv2.min(pixels, floor)
@@ -223,10 +206,8 @@ def darkness(picture: Picture, size: NeedleSize) -> NDArray[np.uint8]:
     light = cv2.blur(cv2.morphologyEx(shown, cv2.MORPH_CLOSE, kernel), (5, 5))
     floor = cv2.min(floor, light)
     share = cv2.divide(pixels, floor, scale=200.0)
-    table = np.clip(
-        255.0 * (2.0 * (1.0 - np.arange(256) / 200.0) / (1.0 - size.max_brightness) - 1.0), 1.0, 255.0
-    ).astype(np.uint8)
-    dark = cv2.LUT(share, table)
+    levels = 2.0 * (1.0 - np.arange(256) / 200.0) / (1.0 - size.max_brightness) - 1.0
+    dark = cv2.LUT(share, np.clip(255.0 * levels, 1.0, 255.0).astype(np.uint8))
     if picture.mask is not None:
         solid = cv2.compare(picture.mask.depth, picture.mask.tolerance_px, cv2.CMP_GT)
         inside[solid > 0] = 0
@@ -299,7 +280,7 @@ def _answer(dark, u, v, angle, curvature, length, width, taper):
         width: of it [px].
         taper: share of its rows at each end, of which the middle alone counts.
     """
-    count = max(8, int(length / (ROWS * width)))
+    count = max(8, int(length / (0.4 * width)))  # rows of samples
     inside, behind, ahead, left, right = 0.0, 0.0, 0.0, 0.0, 0.0
     seen, due = 0, 0
     for place in range(-2, count + 2):
@@ -332,7 +313,7 @@ def _answer(dark, u, v, angle, curvature, length, width, taper):
                 other, is_right_known = _value(dark, x - aside * s, y + aside * c)
                 left += one * is_left_known  # Beyond the wall and in a shape there is nothing.
                 right += other * is_right_known
-    if seen < MIN_SEEN * due:
+    if seen < 0.7 * due:  # too little of the rod is in sight
         return 0.0, 1.0, 1.0, 1.0, 1.0
     return inside / due, 0.5 * left / count, 0.5 * right / count, behind, ahead
 
@@ -363,13 +344,14 @@ def climb(dark, state, length, width, max_bend, taper):
     """Change (u, v, angle, curvature) to where the score is the greatest nearby; return it.
 
     Steps are along the bent axis and aside of it, of its angle and its curvature, halved where none of them is upwards,
-    and begin anew while that gains more than `LEAST_GAIN`: what was too far before may not be any more.
+    and begin anew while that gains more than noise of 2 grey levels over a rod does: what was too far before may not be
+    any more.
     """
     best = _score(dark, state[0], state[1], state[2], state[3], length, width, taper)
     trial, gain = np.empty(4), 1.0
-    while gain > LEAST_GAIN:
+    while gain > 0.002:
         gain, step = -best, width
-        while step > FINEST_PX:
+        while step > 0.2:  # px; noise moves the end of a climb by more
             moved = False
             for kind in range(4):
                 for way in range(-1, 2, 2):

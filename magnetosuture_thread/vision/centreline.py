@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -43,6 +44,7 @@ from magnetosuture_thread.vision.images import (
     greatest_near,
     median,
     middle,
+    nearest,
     runs,
     sampled,
     within,
@@ -54,7 +56,7 @@ from magnetosuture_thread.vision.walk import (
     Ridge,
     black_hat,
     follow,
-    path_buffers,
+    path_buffer,
     refine,
     walk_on,
     worth,
@@ -63,18 +65,10 @@ from magnetosuture_thread.vision.walk import (
 RADIUS_PX, RING = 7.0, 48  # around a path's vertices, that belongs to a crossing; places on it that are looked at
 REACH = round(RADIUS_PX / STEP_PX)  # vertices
 SHOWN = 0.45  # of the usual strength, at least, where a strand leaves it
-DIP = 0.8  # of the weaker of two peaks, at most, between them
-FORK = 3  # arms, where two strands become one
-ARM_PX = 28.0  # over which an arm is measured
 ON_ARM_PX, ALONG = 4.0, 0.3  # from an arm's beginning, where a path goes along it if their cosine is greater
 TURNING, CURVATURE_RATE = 0.01, 1e-4  # 1 / px, 1 / px^3; variances of tangent and curvature for each length
-FREEDOM = 4.0  # degrees of freedom of Student's distribution: some threads bend far more than most
-END_COST = 12.0 + 0.5 * math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of an arm that ends, in any state
-
-Circle = tuple[float, float, float]  # u, v and radius [px]
 
 WALL_PX = 4.0  # before which the walk ends
-SHADE_PX = 10.0  # beside a needle, where its shadow lies
 
 
 @dataclass(frozen=True)
@@ -83,7 +77,6 @@ class Arm:
 
     Attributes:
         path: the walk along it, away from the crossing; see `walk_on`.
-        strong: see there.
         angle: of its tangent where it begins [rad].
         curvature: there [1/px].
         covariance: of the offset, the angle and the curvature there, shape (3, 3).
@@ -91,7 +84,6 @@ class Arm:
     """
 
     path: NDArray[np.float64]
-    strong: NDArray[np.bool_]
     angle: float
     curvature: float
     covariance: NDArray[np.float64]
@@ -108,12 +100,7 @@ class Arm:
 
 
 def resolve_crossings(
-    ridge: Ridge,
-    dish: Circle,
-    max_length: float,
-    path: NDArray[np.float64],
-    strong: NDArray[np.bool_],
-    count: int,
+    ridge: Ridge, max_length: float, path: NDArray[np.float64], count: int
 ) -> tuple[int, list[tuple[int, float]]]:
     """Take the most probable way wherever other strands meet a path, and walk on from there.
 
@@ -122,10 +109,8 @@ def resolve_crossings(
 
     Args:
         ridge: that is followed.
-        dish: see `walk_on`.
         max_length: of the path [px].
         path: see `walk_on`; changed where another way is taken.
-        strong: see there.
         count: vertices that there are.
 
     Returns:
@@ -139,11 +124,11 @@ def resolve_crossings(
         if not places:
             break
         low, high = places.pop(0)
-        arms = find_arms(ridge, dish, path[low - 1 : high])
-        if len(arms) == FORK and places and places[0][0] - high <= 24:
+        arms = find_arms(ridge, path[low - 1 : high])
+        if len(arms) == 3 and places and places[0][0] - high <= 24:
             after, end = places[0]
-            if len(find_arms(ridge, dish, path[after - 1 : end])) == FORK:
-                high, arms = end, find_arms(ridge, dish, path[low - 1 : end])
+            if len(find_arms(ridge, path[after - 1 : end])) == 3:
+                high, arms = end, find_arms(ridge, path[low - 1 : end])
         begin = high + REACH
         first, beyond = max(0, low - 2 * REACH), min(count, high + 2 * REACH)
         entry = arm_of(arms, path[first : low + 1], leaving=False)
@@ -154,7 +139,7 @@ def resolve_crossings(
         turn = (path[high - 1, 5] - path[low - 1, 5]) * float(np.mean([abs(arm.curvature) for arm in arms]))
         overrules = turn < 1.5 and len(arms) % 2 == 0
         taken = arm_of(arms, path[high - 1 : beyond], leaving=True)
-        chances = continuations(ridge, dish, (float(path[low, 5]), max_length), arms, entry)
+        chances = continuations(ridge, (float(path[low, 5]), max_length), arms, entry)
         best = int(np.argmax(chances))
         if best in (entry, taken) or not overrules:
             # Best as entry: the thread ends here, or nothing that is seen goes on from it.
@@ -163,14 +148,14 @@ def resolve_crossings(
             crossings.append((low, float(chances[taken]) if taken >= 0 else 0.0))
             continue
         away = np.hypot(*(path[first : low + 1, :2] - arms[entry].start).T)
-        count, begin = _turn(path, strong, first + int(np.argmin(away)) + 1, arms[entry], arms[best])
+        count, begin = _turn(path, first + int(np.argmin(away)) + 1, arms[entry], arms[best])
         crossings.append((low, float(chances[best])))
         begin += REACH
         longer = np.flatnonzero(path[:count, 5] > max_length)
         if len(longer):
             count = max(2, int(longer[0]))
             break
-        count = walk_on(ridge, dish, max_length, path, strong, count)
+        count = walk_on(ridge, max_length, path, count)
     return count, [each for each in crossings if each[0] < count]
 
 
@@ -192,7 +177,7 @@ def strands_meet(ridge, path, meets):
 
     Args:
         ridge: see `Ridge`.
-        path: shape (m, 6), see `walk_on`.
+        path: shape (m, 7), see `walk_on`.
         meets: filled, shape (m,).
     """
     hidden = ridge.hidden
@@ -224,27 +209,25 @@ def strands_meet(ridge, path, meets):
         meets[index] = peaks > 2
 
 
-def _turn(path: NDArray[np.float64], strong: NDArray[np.bool_], at: int, entry: Arm, out: Arm) -> tuple[int, int]:
+def _turn(path: NDArray[np.float64], at: int, entry: Arm, out: Arm) -> tuple[int, int]:
     """Lead a path from a vertex on from one arm to another; return how many vertices it has, and where that begins."""
     curve = joining_curve(entry, out)[1:]
-    rows = np.vstack([np.zeros((len(curve), 6)), out.path[1:]])[: len(path) - at]
-    shown = np.concatenate([np.ones(len(curve), np.bool_), out.strong[1:]])[: len(rows)]
+    rows = np.vstack([np.zeros((len(curve), 7)), out.path[1:]])[: len(path) - at]
     curve = curve[: len(rows)]
     along = np.gradient(np.vstack([path[at - 1, :2], curve]), axis=0)[1:]
     rows[: len(curve), :2], rows[: len(curve), 2] = curve, np.arctan2(along[:, 1], along[:, 0])
-    rows[: len(curve), 3], rows[: len(curve), 4] = out.curvature, path[at - 1, 4]
+    rows[: len(curve), 3], rows[: len(curve), 4], rows[: len(curve), 6] = out.curvature, path[at - 1, 4], 1.0
     count = at + len(rows)
-    path[at:count], strong[at:count] = rows, shown
+    path[at:count] = rows
     path[at - 1 : count, 5] = path[at - 1, 5] + arc_lengths(path[at - 1 : count, :2])
     return count, at + len(curve)
 
 
-def find_arms(ridge: Ridge, dish: Circle, part: NDArray[np.float64]) -> list[Arm]:
+def find_arms(ridge: Ridge, part: NDArray[np.float64]) -> list[Arm]:
     """Walk out of a crossing on every side.
 
     Args:
         ridge: that is followed.
-        dish: see `walk_on`.
         part: the vertices of a path that belong to the crossing; see `walk_on`.
     """
     edge, usual = _edge_around(part[:, :2]), float(median(part[:, 4]))
@@ -256,13 +239,10 @@ def find_arms(ridge: Ridge, dish: Circle, part: NDArray[np.float64]) -> list[Arm
     for peak in sorted(_peaks(values, max(SHOWN * usual, ridge.faintest)), key=lambda index: -values[index]):
         start = edge[peak]
         outward = start - part[np.argmin(((part[:, :2] - start) ** 2).sum(axis=1)), :2]
-        along = (
-            sampled(ridge.strength, start + np.array([-3.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0])[:, None, None] * ways)
-            - ridge.noise
-        )
-        score = np.minimum(along, STRONGEST * usual).mean(axis=0)
+        places = start + np.array([-3.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0])[:, None, None] * ways
+        score = np.minimum(sampled(ridge.strength, places) - ridge.noise, STRONGEST * usual).mean(axis=0)
         score[ways @ outward < 0.0] = -np.inf
-        arm = _arm(ridge, dish, start, float(turns[np.argmax(score)]), usual)
+        arm = _arm(ridge, start, float(turns[np.argmax(score)]), usual)
         if arm is None or _stays(arm, part[:, :2]) or any(other.covers(arm.start) for other in arms):
             continue
         arms = [other for other in arms if not arm.covers(other.start)] + [arm]
@@ -288,29 +268,31 @@ def _edge_around(points: Points) -> Points:
 
 def _peaks(values: NDArray[np.floating], bound: float) -> list[int]:
     """Return the peaks above a bound along a closed line, of those without a dip between them the highest."""
+    dip = 0.8  # of the weaker of two peaks, at most, between them
     found: list[int] = []
     first, top, low = int(np.argmin(values)), -1, math.inf
     for index in (np.arange(len(values) + 1) + first) % len(values):
         value = float(values[index])
-        if top >= 0 and value < DIP * values[top]:
+        if top >= 0 and value < dip * values[top]:
             found.append(top)
             top, low = -1, value
         elif top >= 0:
             top = int(index) if value > values[top] else top
         else:
             low = min(low, value)
-            top = int(index) if value > bound and low < DIP * value else -1
+            top = int(index) if value > bound and low < dip * value else -1
     return found
 
 
-def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) -> Arm | None:
+def _arm(ridge: Ridge, start: Points, angle: float, usual: float) -> Arm | None:
     """Walk along an arm, and measure it where it begins; None if it is too short."""
-    path, strong = path_buffers(ARM_PX)
+    length = 28.0  # px, over which an arm is measured
+    path = path_buffer(length)
     path[0, :5] = start[0], start[1], angle, 0.0, usual
-    count = walk_on(ridge, dish, ARM_PX, path, strong, 1)
+    count = walk_on(ridge, length, path, 1)
     if count <= 4:
         return None
-    path, strong = path[1:count], strong[1:count]  # The first vertex isn't in the ridge's middle.
+    path = path[1:count]  # The first vertex isn't in the ridge's middle.
     path[:, 5] -= path[0, 5]
     steps = np.diff(path[:, :2], axis=0)
     angles = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -324,7 +306,7 @@ def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) 
     covariance = np.zeros((3, 3))
     covariance[0, 0], covariance[1:, 1:] = 0.4**2, np.linalg.inv(design.T @ weights)
     begun, curvature = covariance[1:, 1:] @ weights.T @ angles
-    return Arm(path, strong, float(begun), float(curvature), covariance, float(median(path[:, 4])))
+    return Arm(path, float(begun), float(curvature), covariance, float(median(path[:, 4])))
 
 
 def arm_of(arms: list[Arm], part: NDArray[np.float64], *, leaving: bool) -> int:
@@ -348,12 +330,8 @@ def joining_curve(one: Arm, other: Arm) -> Points:
 def cubic(start: Points, end: Points, leaving: Points, arriving: Points, count: int) -> Points:
     """Return points of the cubic from one point to another with given tangents, shape (count, 2)."""
     t = np.linspace(0.0, 1.0, count)[:, None]
-    return np.asarray(
-        (1.0 + 2.0 * t) * (1.0 - t) ** 2 * start
-        + t * (1.0 - t) ** 2 * leaving
-        + t * t * (3.0 - 2.0 * t) * end
-        + t * t * (t - 1.0) * arriving
-    )
+    from_start = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * start + t * (1.0 - t) ** 2 * leaving
+    return np.asarray(from_start + t * t * (3.0 - 2.0 * t) * end + t * t * (t - 1.0) * arriving)
 
 
 def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
@@ -373,7 +351,8 @@ def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
     wander[:2, :2] += TURNING * np.array([[g**3 / 3.0, g**2 / 2.0], [g**2 / 2.0, g]])
     spread = carry @ one.covariance @ carry.T + other.covariance + wander
     distance = float(error @ np.linalg.solve(spread, error))
-    bend = 0.5 * (FREEDOM + 3.0) * math.log1p(distance / FREEDOM)
+    freedom = 4.0  # degrees of freedom of Student's distribution: some threads bend far more than most
+    bend = 0.5 * (freedom + 3.0) * math.log1p(distance / freedom)
     bend += 0.5 * float(np.log(np.linalg.det(2.0 * np.pi * spread)))
     stronger = max(one.strength, other.strength)
     shown = (sampled(ridge.strength, curve[1:-1]) - ridge.noise) / (0.5 * SHOWN * (one.strength + other.strength))
@@ -383,7 +362,7 @@ def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
 
 
 def _beyond(
-    ridge: Ridge, dish: Circle, max_length: float, arms: list[Arm], entry: int
+    ridge: Ridge, max_length: float, arms: list[Arm], entry: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Walk along all arms but the one by which a strand comes.
 
@@ -395,9 +374,9 @@ def _beyond(
     for number, arm in enumerate(arms):
         if number == entry:
             continue
-        path, strong = path_buffers(max_length)
+        path = path_buffer(max_length)
         path[: len(arm.path)] = arm.path
-        count = walk_on(ridge, dish, max_length, path, strong, len(arm.path))
+        count = walk_on(ridge, max_length, path, len(arm.path))
         lengths[number] = path[count - 1, 5]
         later, back = path[len(arm.path) // 2 : count], count
         for other in set(range(len(arms))) - {number}:
@@ -420,29 +399,22 @@ def pairings(arms: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], ...]]:
             yield ((arms[0], other), *rest)
 
 
-def continuations(
-    ridge: Ridge,
-    dish: Circle,
-    lengths: tuple[float, float],
-    arms: list[Arm],
-    entry: int,
-) -> NDArray[np.float64]:
+def continuations(ridge: Ridge, lengths: tuple[float, float], arms: list[Arm], entry: int) -> NDArray[np.float64]:
     """Return how probable it is that a strand goes on along each arm, shape (n,).
 
     Args:
         ridge: that is followed.
-        dish: see `walk_on`.
         lengths: of the strand up to here, and of the whole thread at most [px].
         arms: n strands that leave a crossing.
         entry: number of the arm by which the strand comes; its own probability is that the strand ends.
     """
     count = len(arms)
-    costs = np.full((count, count), END_COST)
-    for one in range(count):
-        for other in range(one + 1, count):
-            cost = 0.5 * (_cost(ridge, arms[one], arms[other]) + _cost(ridge, arms[other], arms[one]))
-            costs[one, other] = costs[other, one] = cost
-    closed, beyond = _beyond(ridge, dish, lengths[1], arms, entry)
+    # That of an arm that ends, in any state.
+    costs = np.full((count, count), 12.0 + 0.5 * math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2))
+    for one, other in combinations(range(count), 2):
+        cost = 0.5 * (_cost(ridge, arms[one], arms[other]) + _cost(ridge, arms[other], arms[one]))
+        costs[one, other] = costs[other, one] = cost
+    closed, beyond = _beyond(ridge, lengths[1], arms, entry)
     costs[closed] = np.inf
     # A thread that ends before 85 % of its length costs more, in full before 65 %.
     early = 4.0 * np.clip((0.85 - (lengths[0] + beyond) / lengths[1]) / 0.2, 0.0, 1.0)
@@ -491,7 +463,9 @@ def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_le
     """
     wall = picture.wall
     hidden = glare_mask(picture)
-    _cover_needle(hidden, needle)
+    # At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
+    box, covered = needle.area(hidden.shape, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
+    hidden[box][covered] = 255
     inside = wall.inside(picture.shape, RIM_PX)
     # What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
     gray = np.asarray(cv2.copyTo(gray, inside, picture.darkest.floor.copy()), dtype=np.uint8)
@@ -499,44 +473,34 @@ def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_le
     tail, direction = needle.tail_px, needle.direction_px
     start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
 
-    def walked(*, wide: bool) -> tuple[Ridge, NDArray[np.float64], NDArray[np.bool_], int, float]:
-        """Return a ridge, the path along it, where it is visible, its vertices and how much thread they show."""
-        ridge = black_hat(gray, hidden, inside, wide=wide)
+    def walked(*, wide: bool) -> tuple[Ridge, NDArray[np.float64], int, float]:
+        """Return a ridge, the path along it, its vertices and how much thread they show."""
+        ridge = black_hat(gray, hidden, inside, dish, wide=wide)
         _clear_shade(ridge, picture, needle)
-        path, strong = path_buffers(max_length)
+        path = path_buffer(max_length)
         # Hidden by the needle and what is next to it.
-        count = follow(ridge, start, dish, max_length, needle.length_px + 12.0, path, strong)
-        return ridge, path, strong, count, worth(path, strong, count)
+        count = follow(ridge, start, max_length, needle.length_px + 12.0, path)
+        return ridge, path, count, worth(path, count)
 
-    ridge, path, strong, count, shown = walked(wide=False)
+    ridge, path, count, shown = walked(wide=False)
     if shown < 0.5 * max_length and (other := walked(wide=True))[-1] > shown + 0.4 * max_length:
-        ridge, path, strong, count, _ = other
-    count, crossings = resolve_crossings(ridge, dish, max_length, path, strong, count)
+        ridge, path, count, _ = other
+    count, crossings = resolve_crossings(ridge, max_length, path, count)
     if picture.mask is not None:
         above = cv2.subtract(ridge.strength, ridge.noise)
         count = min(count, count_off_outline(path[:count, :2], above, picture.mask, ridge.faintest))
     points = path[:count, :2].copy()
-    refine(ridge, points, strong[:count])
+    refine(ridge, points, path[:count, 6] > 0.0)
     doubtful = [first for first, confidence in crossings if confidence < 0.9]
     return points[: max(2, min(doubtful))] if doubtful else points
 
 
 def _clear_shade(ridge: Ridge, picture: Picture, needle: MeasuredNeedle) -> None:
     """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
-    # A shadow has 12 % of steel's darkness.
+    # A shadow has 12 % of steel's darkness, and lies within 10 px.
     shade = 0.12 * needle.contrast * middle(picture.darkest.floor[::4, ::4])
-    length, width = needle.length_px, needle.width_px + 2.0 * SHADE_PX
-    box, beside = needle.area(picture.shape, SHADE_PX, length, width)
+    box, beside = needle.area(picture.shape, 10.0, needle.length_px, needle.width_px + 2.0 * 10.0)
     ridge.strength[box][beside & (ridge.strength[box] < shade)] = 0
-
-
-def _cover_needle(hidden: Gray, needle: MeasuredNeedle) -> None:
-    """Mark where a needle hides the thread.
-
-    At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
-    """
-    box, covered = needle.area(hidden.shape, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
-    hidden[box][covered] = 255
 
 
 def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask, faintest: float) -> int:
@@ -552,7 +516,7 @@ def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask,
         mask: of the picture.
         faintest: a strength that is no noise.
     """
-    depths = mask.depths(points)
+    depths = nearest(mask.depth, points)
     inside = depths > mask.tolerance_px
     if inside.any():  # Whatever was followed from here on, it is no thread.
         first = max(1, int(np.argmax(inside)))

@@ -35,12 +35,10 @@ from magnetosuture_thread.settings.files import MAX_PIXELS
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
 BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line
-OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
 
 CELL_PX = 8  # side of a cell of the grid on which the floor's brightness is known
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
 NEXT = np.uint64(1)  # Indices without a sign save compiled code the check for negative ones, which count from the end.
-FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 
 Gray = NDArray[np.uint8]
 
@@ -105,19 +103,8 @@ class SceneMask:
         """Return the brightness of cells, of those that a shape covers that of the nearest one that shows the floor."""
         rows, columns = cells.shape
         floor = self.floor_cells[:rows, :columns]
-        nothing = np.empty(0)
-        shown = cv2.remap(cells, floor, nothing, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        shown = cv2.remap(cells, floor, np.empty(0), cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(shown, dtype=np.uint8)
-
-    def deepest(self, low: Points, high: Points) -> float:
-        """Return how deep the deepest pixel of a box (u, v) to (u, v) lies in a shape; negative if it touches none."""
-        left, top = (max(0, int(value)) for value in low)
-        box = self.depth[top : max(top, int(high[1]) + 1), left : max(left, int(high[0]) + 1)]
-        return float(cv2.minMaxLoc(box)[1]) if box.size else -OUTSIDE_DEPTH_PX
-
-    def depths(self, points: Points) -> NDArray[np.float32]:
-        """Return how deep points lie in a shape, negative outside of all, shape (m,) [px]."""
-        return nearest(self.depth, points)
 
 
 def scene_mask(scene: Scene, view: DishView, shape: tuple[int, ...], tolerance: float) -> SceneMask | None:
@@ -181,7 +168,7 @@ def _rim(scene: Scene, view: DishView) -> Points:
 def _distance(inside: Gray) -> NDArray[np.float32]:
     """Return the distance of each pixel of a mask from its edge, half a pixel from the next one; 0 outside [px]."""
     if inside.all():
-        return np.full(inside.shape, OUTSIDE_DEPTH_PX, np.float32)
+        return np.full(inside.shape, 1e4, np.float32)  # px; deeper than any image is wide
     apart = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(np.maximum(apart - 0.5, 0.0), dtype=np.float32)
 
@@ -275,26 +262,24 @@ def prepare(
         both = _layer(np.ascontiguousarray(image), places, mask)
         return Picture(both, both, view, wall, mask, image)
     one, two, three = cv2.split(image)
-    if weights:
-        brightest = _layer(np.asarray(cv2.transform(image, np.array([weights]))), places, mask)
-    else:
-        brightest = _layer(np.asarray(cv2.max(cv2.max(one, two), three)), places, mask)
-    darkest = _layer(np.asarray(cv2.min(cv2.min(one, two), three)), places, mask)
-    return Picture(brightest, darkest, view, wall, mask, image)
+    brightest = cv2.transform(image, np.array([weights])) if weights else cv2.max(cv2.max(one, two), three)
+    darkest = cv2.min(cv2.min(one, two), three)
+    light, dark = (_layer(np.asarray(pixels), places, mask) for pixels in (brightest, darkest))
+    return Picture(light, dark, view, wall, mask, image)
 
 
 def _floor_places(shape: tuple[int, ...], wall: Wall) -> NDArray[np.float32]:
     """Return for each cell the place (u, v) among the cells where its floor is taken from, shape (rows, columns, 2).
 
-    Near the wall and beyond it, where the floor is mixed with the rim's dark, it is that of the place `FLOOR_DEPTH_PX`
-    inside of the wall on the way to the centre.
+    Near the wall and beyond it, where the floor is mixed with the rim's dark, it is that of the place 40 px inside of
+    the wall on the way to the centre.
     """
     rows, columns = (max(2, size // CELL_PX) for size in shape)
     down, right = shape[0] / rows, shape[1] / columns  # px a cell
     u = ((np.arange(columns) + 0.5) * right - 0.5 - wall.centre[0]).astype(np.float32)
     v = ((np.arange(rows) + 0.5) * down - 0.5 - wall.centre[1]).astype(np.float32)[:, None]
     # Not hypot, which takes several times as long.
-    share = np.minimum(1.0, max(0.0, wall.radius - FLOOR_DEPTH_PX) / np.maximum(np.sqrt(u * u + v * v), 1.0))
+    share = np.minimum(1.0, max(0.0, wall.radius - 40.0) / np.maximum(np.sqrt(u * u + v * v), 1.0))
     at = np.empty((rows, columns, 2), np.float32)
     at[..., 0] = (share * u + (wall.centre[0] + 0.5)) / right - 0.5
     at[..., 1] = (share * v + (wall.centre[1] + 0.5)) / down - 0.5
@@ -438,9 +423,8 @@ def check_image(image: np.ndarray) -> None:
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise InvalidInputError("image", f"{image.dtype} of shape {image.shape}", "8-bit grey or BGR pixels")
     if min(image.shape[:2]) < MIN_SIDE_PX:
-        raise InvalidInputError(
-            "image", f"{image.shape[1]} x {image.shape[0]} pixels", f"at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels"
-        )
+        expected = f"at least {MIN_SIDE_PX} x {MIN_SIDE_PX} pixels"
+        raise InvalidInputError("image", f"{image.shape[1]} x {image.shape[0]} pixels", expected)
 
 
 def measured_channel(image: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.candidates import DARK_END, Candidate, Prior, find_candidates, is_unique
-from magnetosuture_thread.vision.images import RIM_PX, Picture, SceneMask, median, middle
+from magnetosuture_thread.vision.images import RIM_PX, Picture, SceneMask, median, middle, nearest
 from magnetosuture_thread.vision.template import (
     BESIDE_PX,
     BLOOM_PX,
@@ -151,7 +151,7 @@ def _measured(
 
 def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
     """Say whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
-    depths = mask.depths(needle.arc.at(needle.length_px / 14.0 * np.arange(15.0)))
+    depths = nearest(mask.depth, needle.arc.at(needle.length_px / 14.0 * np.arange(15.0)))
     return middle(depths) > mask.tolerance_px - 0.5 * width
 
 

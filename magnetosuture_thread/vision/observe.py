@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import cv2
@@ -50,17 +51,14 @@ from magnetosuture_thread.vision.appearance import (
 from magnetosuture_thread.vision.arc import MeasuredNeedle
 from magnetosuture_thread.vision.centreline import chances_of, cubic
 from magnetosuture_thread.vision.images import Gray, Picture, median, middle, runs, sampled
-from magnetosuture_thread.vision.walk import Ridge, path_buffers, walk_on
+from magnetosuture_thread.vision.walk import Ridge, path_buffer, walk_on
 
 MIN_SEED_PX, MIN_LENGTH_PX = 6, 12.0  # of a ridge from which a walk begins, and of a piece
-MAX_TWICE_PX = 10.0  # along another line, that a line may run near it where it only crosses it
-AHEAD_PX, AHEAD = (3.0, 5.0, 7.0, 9.0, 11.0), math.radians(50.0)  # beyond an end, where floor must be visible
+AHEAD_PX = (3.0, 5.0, 7.0, 9.0, 11.0)  # beyond an end, where floor must be visible
 BESIDE_POINTS = 6  # last vertices of a piece, beside which its floor is measured
-BARE_COLOUR = 0.03  # of it, by which colours may change apart, on average over the farthest rings
 LENGTH_TOLERANCE = 0.03  # of the thread's length, that a whole thread may be seen shorter or longer by
 LENGTH_ERROR = 0.01  # of an arc length: by noise along the walk
 END_ERROR_PX = 4.0  # of an arc length, by the places where pieces begin and end
-TURNING = 60.0  # rad^2 / m; variance by which a thread's tangent turns along it
 MAX_PRICE = 12.0  # of one gap; half of it for each end that is joined to none
 
 
@@ -112,10 +110,9 @@ def observe(
         return ThreadObservation((first,), hidden=(_outline(needle, view),))
     hiding = find_hiding(picture, needle)
     on_floor = np.array([hiding.area_at(point) == 0 for point in line.points])
-    line = Strand(line.points, line.strength, line.visible & on_floor)
-    parts = parts_without(
-        line, gaps_of(line.visible, GAP_PX, begin) | gaps_of(line.visible | below, OBJECT_GAP_PX, begin)
-    )
+    line = replace(line, visible=line.visible & on_floor)
+    gone = gaps_of(line.visible, GAP_PX, begin) | gaps_of(line.visible | below, OBJECT_GAP_PX, begin)
+    parts = parts_without(line, gone)
     begun, shown = parts[0], np.flatnonzero(parts[0].visible)
     if len(shown):
         begun = begun.part(0, max(2, int(shown[-1]) + 1))
@@ -280,7 +277,8 @@ def find_order(
             (before, first_side), (after, last_side) = ends[one], ends[other]
             leaving = lines[before] if first_side else lines[before][::-1]
             arriving = lines[after][::-1] if last_side else lines[after]
-            gap = _gap(leaving, arriving, hiding, TURNING * metres_per_pixel) if before != after else None
+            # A thread's tangent turns along it by a variance of 60 rad^2 / m.
+            gap = _gap(leaving, arriving, hiding, 60.0 * metres_per_pixel) if before != after else None
             if gap is not None and lengths[before] + gap[1] + lengths[after] <= longest:
                 if one == 0:
                     straight_and_curved[other] = gap[1:]
@@ -303,11 +301,10 @@ def find_order(
     if not areas[end[0]][end[1]] and last.arc_length[1] + lengths[last.index] < length[0]:
         return placed[:1]  # It ends in sight and is too short: a piece between two of these is left out.
     rest = np.cumsum(way[::-1])[::-1][::2]  # from the beginning of each piece on, at least
-    result = []
-    for each, later in zip(placed, rest, strict=True):
-        low, high = each.arc_length
-        result.append(replace(each, arc_length=(low, max(low, min(high, longest - float(later))))))
-    return result
+    for index, later in enumerate(rest):
+        low, high = placed[index].arc_length
+        placed[index] = replace(placed[index], arc_length=(low, max(low, min(high, longest - float(later)))))
+    return placed
 
 
 def _gap(before: Points, after: Points, hiding: Hiding, turning: float) -> tuple[float, float, float] | None:
@@ -335,13 +332,11 @@ def _angle(from_: Points, to: Points) -> float:
     return math.atan2(from_[0] * to[1] - from_[1] * to[0], float(from_ @ to))
 
 
+@cache
 def _off_line() -> NDArray[np.float64]:
     """Return the matrix that takes light at the vertices and ahead to what it is off a straight line fitted to it."""
     line = np.vander(np.concatenate([SPACING_PX * np.arange(1 - BESIDE_POINTS, 1), AHEAD_PX]), 2)
     return np.asarray(np.eye(len(line)) - line @ np.linalg.pinv(line))
-
-
-OFF_LINE = _off_line()
 
 
 def two_sided_ridge(gray: Gray, thread: Appearance, hiding: Hiding) -> Gray:
@@ -391,7 +386,6 @@ def find_pieces(
     if max_length < MIN_LENGTH_PX or thread.strength < 2.0 * FAINTEST:  # The floor's texture looks like a faint thread.
         return []
     ridge = two_sided_ridge(gray, thread, hiding)
-    (u, v), reach = hiding.wall.centre, hiding.wall.radius - WALL_PX
     ridge[~hiding.inside] = 0
     inside = hiding.inside[::5, ::5]
     noise = middle(ridge[::5, ::5][inside]) if inside.any() else 0.0
@@ -400,12 +394,13 @@ def find_pieces(
     for line in known:
         _clear(fresh, line, thread.beside_px)
     found: list[Points] = []
-    walked, dish = Ridge(ridge, np.zeros_like(ridge), noise, faintest), (u, v, reach)
+    dish = *hiding.wall.centre, hiding.wall.radius - WALL_PX
+    walked = Ridge(ridge, np.zeros_like(ridge), noise, faintest, dish)
     for _ in range(24):
         seed = _seed(fresh, ridge)
         if seed is None:
             break
-        line = _traced(walked, seed, max(thread.strength, faintest), dish, max_length + MIN_LENGTH_PX)
+        line = _traced(walked, seed, max(thread.strength, faintest), max_length + MIN_LENGTH_PX)
         _clear(fresh, line, thread.beside_px)
         cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
         for part in fresh_parts(line, known + found):
@@ -436,19 +431,13 @@ def _seed(fresh: NDArray[np.uint8], ridge: Gray) -> tuple[float, float, float] |
     return float(u + left), float(v + top), math.atan2(along[1], along[0])
 
 
-def _traced(
-    ridge: Ridge,
-    seed: tuple[float, float, float],
-    strength: float,
-    dish: tuple[float, float, float],
-    max_length: float,
-) -> Points:
+def _traced(ridge: Ridge, seed: tuple[float, float, float], strength: float, max_length: float) -> Points:
     """Walk from a place along a ridge to both of its ends."""
     halves = []
     for turn in (math.pi, 0.0):
-        path, strong = path_buffers(max_length)
+        path = path_buffer(max_length)
         path[0, :5] = seed[0], seed[1], seed[2] + turn, 0.0, strength
-        count = walk_on(ridge, dish, max_length, path, strong, 1)
+        count = walk_on(ridge, max_length, path, 1)
         halves.append(path[:count, :2].copy())
     line = np.vstack([halves[0][::-1], halves[1][1:]])
     return line if len(line) > 1 else np.vstack([line, line + 1e-3])
@@ -466,10 +455,11 @@ def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
     others = np.vstack([line, *(respaced(other, 1.0) for other in known)])
     # Within 2.5 px it shows the same thread, unless it only crosses it.
     near = np.linalg.norm(line[:, None] - others, axis=2) < 2.5
-    near[:, : len(line)] &= np.tri(len(line), k=-int(MAX_TWICE_PX) - 1, dtype=np.bool_)  # its own from long before
+    most = 10  # px along another line, that a line runs near it where it only crosses it
+    near[:, : len(line)] &= np.tri(len(line), k=-most - 1, dtype=np.bool_)  # its own from long before
     twice = near.any(axis=1)
     for first, last in runs(twice):
-        if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
+        if last - first < most and first > 0 and last < len(twice):
             twice[first:last] = False
     return [line[first:last] for first, last in runs(~twice) if last - first > 1]
 
@@ -522,7 +512,7 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
         return False
     point, way = strand.points[-1], end_direction(strand.points)
     angle = math.atan2(way[1], way[0])
-    turns, reach = angle + AHEAD * np.arange(-1.0, 1.1, 0.25), np.array(AHEAD_PX)
+    turns, reach = angle + math.radians(50.0) * np.arange(-1.0, 1.1, 0.25), np.array(AHEAD_PX)
     ahead = point + reach[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     rows, columns = gray.shape
     if ahead.min() < 2.0 or (ahead > np.array([columns, rows]) - 3.0).any():
@@ -539,6 +529,7 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
     light = np.vstack([median(np.atleast_3d(sampled(picture.image, at)), axis=1) for at in (beside, ahead)])
     light /= np.maximum(median(light[: len(beside)], axis=0), 1.0)
     mean = light.mean(axis=1)
-    step = np.abs(OFF_LINE @ mean).max()
+    step = np.abs(_off_line() @ mean).max()
     even = step < 0.025 and np.abs(mean - 1.0).max() < 0.06
-    return bool(even and np.ptp(light[-3:].mean(axis=0)) < BARE_COLOUR)
+    # Colours may change apart by 3 %, on average over the farthest rings.
+    return bool(even and np.ptp(light[-3:].mean(axis=0)) < 0.03)

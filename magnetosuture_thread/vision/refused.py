@@ -14,10 +14,6 @@ from magnetosuture_thread.vision.images import prepare, scene_mask, shrunk
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import Track
 
-SEEN = 0.88  # share of the floor's brightness below which a thing is seen at all
-SLENDER = 3.0  # length over width of what may be a needle
-WIDTH_TOLERANCE = 0.4  # share of the width as it is set, within which a needle is found
-
 
 @dataclass(frozen=True)
 class Refused:
@@ -65,7 +61,7 @@ def refused_needles(image: np.ndarray, track: Track, scene: Scene, settings: Vis
     picture = prepare(part, small, scene.dish.radius, mask, settings.needle_colour)
     share = picture.brightest.pixels / np.maximum(picture.brightest.floor.astype(np.float32), 1.0)
     whole = slice(0, share.shape[0]), slice(0, share.shape[1])
-    dark = (share < SEEN) & ~picture.wall.beyond(whole, 0.03 * picture.wall.radius)
+    dark = (share < 0.88) & ~picture.wall.beyond(whole, 0.03 * picture.wall.radius)
     if mask is not None:
         dark &= mask.depth < -mask.band_px  # an outline looks like a thing
     dark = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -75,13 +71,13 @@ def refused_needles(image: np.ndarray, track: Track, scene: Scene, settings: Vis
         within = own & (share < 0.5 + 0.5 * np.percentile(share[own], 10.0))  # half-way to the floor
         box = cv2.minAreaRect(np.argwhere(within)[:, ::-1].astype(np.float32))
         width, length = sorted((side + 1.0) * small.metres_per_pixel for side in box[1])
-        if length < SLENDER * width:
+        if length < 3.0 * width:  # of what may be a needle
             continue
         brightness, admitted = float(np.median(share[within])), dict[str, float]()
         off = abs(length / settings.needle_length - 1.0)
         if off > SET_TOLERANCE:
             admitted["needle_length"] = float(f"{length:.2g}")
-        if abs(width / settings.needle_width - 1.0) > WIDTH_TOLERANCE:
+        if abs(width / settings.needle_width - 1.0) > 0.4:  # within which a needle is found
             admitted["needle_width"] = float(f"{width:.2g}")
         if brightness + 0.05 > settings.max_needle_brightness:
             admitted["max_needle_brightness"] = round(min(0.95, 0.5 + 0.5 * brightness), 2)  # its edge is blurred

@@ -27,13 +27,7 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 MIN_MARKED_PX = 12.0  # between the marks: of a shorter needle nothing is measured
 MIN_CONTRAST = 0.08  # of the floor's light, that needle and floor differ by at least
-SLACK = 0.3  # of the contrast, by which it may be brighter in other frames
-NOISE = 3.0  # grey levels that every dish varies by
-ASIDE = (0.25, 0.12)  # of the length, to both sides of the marks, within which the needle is, at first and then
-BODY = 0.05  # width over length of most needles, as long as it is not measured
-GAP, BEYOND = 0.1, 0.4  # of the length: a reflection on a needle is shorter; an end is looked for so far out
-BLUNT = 0.75  # of the width in the middle, that a blunt needle has near both ends
-BEND = 0.05  # rad; by which a needle may be more bent than it is measured
+BEYOND = 0.4  # of the length, that an end is looked for so far out
 EDGE = 64  # darkness, 0 to 255, of an end
 
 
@@ -79,12 +73,12 @@ def teach(
         raise InvalidInputError("marks", f"{1e3 * away:.1f} mm from the dish's centre", "tail and tip in the dish")
     colours = image.reshape(*image.shape[:2], -1)
     axis = Arc(np.array(marks[0], float), math.atan2(*(marks[1] - marks[0])[::-1]), 0.0)
-    for reach in ASIDE:
+    for reach in (0.25, 0.12):  # of the length, to both sides of the marks, within which the needle is
         axis = _centred(colours, axis, apart, reach)
-    width = BODY * apart
+    width = 0.05 * apart  # of most needles, as long as it is not measured
     for _ in range(2):  # the second time along the axis, and within the width, as the first one measured it
         weights, ratio, width = _look_of(colours, axis, NeedleSize(apart, width), view, dish_radius)
-        limit = min(0.95, max(0.1, ratio + SLACK * (1.0 - ratio)))
+        limit = min(0.95, max(0.1, ratio + 0.3 * (1.0 - ratio)))  # It may be brighter in other frames.
         picture = prepare(image, view, dish_radius, weights=weights)
         size = NeedleSize(apart, width, max_brightness=limit)
         dark = darkness(picture, size)
@@ -92,10 +86,16 @@ def teach(
     size = replace(size, length_px=apart)
     answers = [(each.arc.at(np.array([0.0, apart])), each.score) for each in find_candidates(picture, size)]
     scale = view.metres_per_pixel
-    told = replace(settings, needle_length=apart * scale, needle_width=width * scale)
-    told = replace(told, max_needle_brightness=limit, needle_colour=weights)
-    bend = min(abs(axis.curvature) * apart + BEND, size.max_bend)
-    told = replace(told, needle_is_blunt=_is_blunt(dark, axis, size), max_needle_bend=bend)
+    bend = min(abs(axis.curvature) * apart + 0.05, size.max_bend)  # rad; it may be more bent than it is measured
+    told = replace(
+        settings,
+        needle_length=apart * scale,
+        needle_width=width * scale,
+        max_needle_brightness=limit,
+        needle_colour=weights,
+        needle_is_blunt=_is_blunt(dark, axis, size),
+        max_needle_bend=bend,
+    )
     return Taught(told, axis.at(np.array([0.0, apart])), 1.0 - ratio, answers, dark)
 
 
@@ -137,7 +137,7 @@ def _look_of(
     v, u = np.mgrid[0:rows:4, 0:columns:4]
     inside = np.hypot(u - view.centre_px[0], v - view.centre_px[1]) < 0.95 * dish_radius / view.metres_per_pixel
     low, high = np.percentile(colours[::4, ::4][inside], (16.0, 84.0), axis=0)  # which a needle in the dish is not in
-    variance = (0.5 * (high - low)) ** 2 + body.var(axis=(0, 1)) + NOISE**2
+    variance = (0.5 * (high - low)) ** 2 + body.var(axis=(0, 1)) + 3.0**2  # grey levels
     weights = np.maximum(floor - needle, 0.0) / variance
     weights = weights / max(weights.sum(), 1e-9)
     ratio = float(needle @ weights / max(float(floor @ weights), 1.0)) if weights.any() else 1.0
@@ -160,13 +160,12 @@ def _measured(dark: NDArray[np.uint8], axis: Arc, size: NeedleSize) -> tuple[Arc
     """Return the axis where the filter answers most nearby, from end to end, and its length [px]."""
     middle = axis.moved(0.5 * size.length_px, 0.0, 0.0, 0.0)
     state = np.array([*middle.start, middle.angle, middle.curvature])
-    climb(
-        dark, state, 0.8 * size.length_px, size.width_px, size.max_bend, 0.0
-    )  # which lies on the needle wherever its ends are
+    # Of a part of the length, which lies on the needle wherever its ends are.
+    climb(dark, state, 0.8 * size.length_px, size.width_px, size.max_bend, 0.0)
     middle = Arc(state[:2], float(state[2]), float(state[3]))
     along = np.arange(-(0.5 + BEYOND) * size.length_px, (0.5 + BEYOND) * size.length_px, 0.5)
     shown = middle.strip(dark, along, np.array([-0.2, 0.0, 0.2]) * size.width_px).mean(axis=1) > EDGE
-    gap = int(GAP * size.length_px / 0.5)
+    gap = int(0.1 * size.length_px / 0.5)  # A reflection on a needle is shorter.
     ends = []
     for part in (shown[len(along) // 2 :], shown[len(along) // 2 :: -1]):
         light = np.convolve(~part, np.ones(gap), "valid") == gap  # from where on it is light for longer than a gap
@@ -181,4 +180,4 @@ def _is_blunt(dark: NDArray[np.uint8], axis: Arc, size: NeedleSize) -> bool:
         float((axis.strip(dark, np.linspace(*part, 8) * size.length_px, aside) > EDGE).sum(axis=1).mean())
         for part in ((0.3, 0.7), (0.04, 0.12), (0.88, 0.96))
     )
-    return min(ends) > BLUNT * middle
+    return min(ends) > 0.75 * middle

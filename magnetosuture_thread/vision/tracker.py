@@ -750,7 +750,7 @@ def warm_up() -> bool:
     image = cv2.GaussianBlur(image, (0, 0), 0.9)
     # What a plain frame does not reach: a needle in one dark thing with its thread, crossings, and other pieces.
     sampled(np.zeros((4, 4), np.float32), np.zeros((1, 2)))
-    path, strong, nothing = np.zeros((8, 6)), np.zeros(8, np.bool_), np.zeros((16, 16), np.uint8)
-    walk_on(Ridge(nothing, nothing, 1.0, 1.0), (8.0, 8.0, 8.0), 4.0, path, strong, 1)
-    worth(path, strong, 1)
+    path, nothing = np.zeros((8, 7)), np.zeros((16, 16), np.uint8)
+    walk_on(Ridge(nothing, nothing, 1.0, 1.0, (8.0, 8.0, 8.0)), 4.0, path, 1)
+    worth(path, 1)
     return not VisionTracker(VisionTrackerSettings(), Scene()).look(image).reason

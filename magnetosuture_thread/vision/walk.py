@@ -23,6 +23,9 @@ ACROSS, ASIDE_PX = 9, 0.5  # samples across a ridge, and the distance between th
 WAYS_AHEAD = 8  # steps of an arc out of the tail, of which at least five must show the thread
 
 
+Circle = tuple[float, float, float]  # u, v and radius [px]
+
+
 class Ridge(NamedTuple):
     """How much darker each pixel is than what is near it.
 
@@ -31,15 +34,17 @@ class Ridge(NamedTuple):
         hidden: where nothing can be seen, not 0 there, of the same shape, uint8.
         noise: strength where nothing is.
         faintest: a strength above noise that is no noise.
+        dish: centre and the farthest that a walk may go from it [px].
     """
 
     strength: np.ndarray
     hidden: np.ndarray
     noise: float
     faintest: float
+    dish: Circle
 
 
-def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray, *, wide: bool) -> Ridge:
+def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray, dish: Circle, *, wide: bool) -> Ridge:
     """Return how much darker an image is than the brightest background within a few pixels.
 
     An edge has no black-hat, so that shadows, covers and the rim are no thread.
@@ -48,6 +53,7 @@ def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray, *, wide:
         gray: shape (rows, columns), uint8.
         hidden: where nothing can be seen, not 0 there, of the same shape, uint8.
         inside: the dish, whose noise is measured, not 0 there, of the same shape, uint8.
+        dish: see `Ridge`.
         wide: whether to look at half the size, for what is wider than a few pixels.
     """
     size = gray.shape[1::-1]
@@ -59,13 +65,12 @@ def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray, *, wide:
         strength = cv2.resize(cv2.GaussianBlur(strength, (0, 0), 1.5), size, interpolation=cv2.INTER_LINEAR)
     some = strength[::5, ::5][inside[::5, ::5] > 0]
     noise = middle(some) if some.size else 0.0
-    return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise))
+    return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise), dish)
 
 
-def path_buffers(max_length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return room for a path of a length [px] and for which of its vertices are visible; see `walk_on`."""
-    max_steps = int(max_length) + 16  # steps are longer than a pixel
-    return np.zeros((max_steps, 6)), np.zeros(max_steps, np.bool_)
+def path_buffer(max_length: float) -> np.ndarray:
+    """Return room for a path of a length [px]; see `walk_on`. Steps are longer than a pixel."""
+    return np.zeros((int(max_length) + 16, 7))
 
 
 def smoothed(gray: np.ndarray) -> np.ndarray:
@@ -144,21 +149,20 @@ def centred(ridge, u, v, angle, max_shift):
 
 
 @compiled_uncounted
-def walk_on(ridge, dish, max_length, path, strong, count):
+def walk_on(ridge, max_length, path, count):
     """Walk along a ridge from a path's last vertex to the ridge's end.
 
     Args:
         ridge: see `Ridge`.
-        dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk [px].
-        path: u, v, angle, bend, usual strength and length at each vertex, shape (most, 6); filled in.
-        strong: whether the thread is visible at each, shape (most,); filled in.
+        path: u, v, angle, bend, usual strength, length, and 1 where the thread is visible, at each vertex, shape
+            (most, 7); filled in.
         count: vertices that there are.
 
     Returns:
         The number of vertices.
     """
-    faintest = ridge.faintest
+    dish, faintest = ridge.dish, ridge.faintest
     u, v, angle = path[count - 1, 0], path[count - 1, 1], path[count - 1, 2]
     bend, usual, length = path[count - 1, 3], path[count - 1, 4], path[count - 1, 5]
     gap, last = 0.0, count
@@ -186,7 +190,7 @@ def walk_on(ridge, dish, max_length, path, strong, count):
         u, v, angle = x, y, turned
         path[count, 0], path[count, 1], path[count, 2] = u, v, angle
         path[count, 3], path[count, 4], path[count, 5] = bend, usual, length
-        strong[count] = seen
+        path[count, 6] = 1.0 if seen else 0.0
         count += 1
         if seen:
             last = count
@@ -308,14 +312,14 @@ def _try(ridge, tail, arc, max_hidden, ways, count):
 
 
 @compiled_inner
-def begin_path(ridge, tail, way, path, strong):
+def begin_path(ridge, tail, way, path):
     """Begin a path along a way out, up to where the thread can be seen; see `walk_on`.
 
     Returns:
         The number of vertices.
     """
     path[0, 0], path[0, 1], path[0, 2] = tail[0], tail[1], 0.0
-    path[0, 3], path[0, 4], path[0, 5], strong[0] = 0.0, 0.0, 0.0, False
+    path[0, 3], path[0, 4], path[0, 5], path[0, 6] = 0.0, 0.0, 0.0, 0.0
     u, v, s, turned, step, count = tail[0], tail[1], 0.0, 0.0, 3.0, 1
     until = max(way[2], 3.0)
     if abs(way[1]) > 0.1:  # A small bend is laid as a whole: the walk does not turn as sharply.
@@ -330,19 +334,20 @@ def begin_path(ridge, tail, way, path, strong):
         s += step
         path[count, 0], path[count, 1], path[count, 2], path[count, 3] = u, v, way[0] + turned, turn / step
         path[count, 4], path[count, 5] = max(way[3], ridge.faintest), s
-        strong[count] = s >= way[2] and sample(ridge.strength, u, v) - ridge.noise > ridge.faintest
+        visible = s >= way[2] and sample(ridge.strength, u, v) - ridge.noise > ridge.faintest
+        path[count, 6] = 1.0 if visible else 0.0
         count += 1
         step = STEP_PX
     return count
 
 
 @compiled_uncounted
-def worth(path, strong, count):
+def worth(path, count):
     """Return how much thread a path shows, none of it twice [px], less its unsteadiness."""
     value = 0.0
     for index in range(1, count):
         step = path[index, 5] - path[index - 1, 5]
-        fresh = strong[index]
+        fresh = path[index, 6] > 0.0
         if fresh:
             for other in range(0, index - 6):
                 u, v = path[index, 0] - path[other, 0], path[index, 1] - path[other, 1]
@@ -356,17 +361,15 @@ def worth(path, strong, count):
 
 
 @compiled
-def follow(ridge, start, dish, max_length, max_hidden, path, strong):
+def follow(ridge, start, max_length, max_hidden, path):
     """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
 
     Args:
         ridge: see `Ridge`.
         start: the tail (u, v) and the needle's direction there [px, px, rad].
-        dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk, a little longer than the thread [px].
         max_hidden: of the thread below the needle, at most [px].
         path: filled; see `walk_on`.
-        strong: filled; see `walk_on`.
 
     Returns:
         The number of vertices.
@@ -374,17 +377,15 @@ def follow(ridge, start, dish, max_length, max_hidden, path, strong):
     ways = np.empty((5, 8))
     found = ways_out(ridge, start, max_hidden, ways)
     path[0, 0], path[0, 1], path[0, 2] = start[0], start[1], 0.0
-    path[0, 3], path[0, 4], path[0, 5], strong[0] = 0.0, 0.0, 0.0, False
+    path[0, 3], path[0, 4], path[0, 5], path[0, 6] = 0.0, 0.0, 0.0, 0.0
     best, best_value, enough = 1, 0.0, 0.9 * max_length  # so much thread needs no other way
-    other, other_strong = np.empty_like(path), np.empty_like(strong)
+    other = np.empty_like(path)
     for index in range(found):
-        count = begin_path(ridge, start, ways[index], other, other_strong)
-        count = walk_on(ridge, dish, max_length, other, other_strong, count)
-        value = worth(other, other_strong, count)
+        count = walk_on(ridge, max_length, other, begin_path(ridge, start, ways[index], other))
+        value = worth(other, count)
         if value > 1.25 * best_value + (8.0 if index > 0 else 0.0):  # px; the first begins strongest
             best, best_value = count, value
             for vertex in range(count):
-                strong[vertex] = other_strong[vertex]
                 for column in range(path.shape[1]):
                     path[vertex, column] = other[vertex, column]
         if best_value > enough:
