@@ -90,24 +90,24 @@ def observe(
     if len(walk) < 2 or arc_lengths(walk)[-1] < SPACING_PX:
         return ThreadObservation()
     walk = respaced(walk, SPACING_PX)
-    view, below = picture.view, below_needle(needle, walk)
+    below = below_needle(needle, walk)
     thread = appearance_of(picture, gray, walk, ~below)
+    seen = _Seen(picture, gray, needle, thread, scale_known)
     line, plain = strand_along(gray, thread, walk)
     line = replace(line, visible=line.visible & ~below)
-    length = thread_length / view.metres_per_pixel
+    length = thread_length / picture.view.metres_per_pixel
     begin = first_clear_of(needle, walk)
     gone = gaps_of(line.visible, GAP_PX, begin)
     parts = parts_without(line, gone)
-    in_dish = _Dish(view, thread, scale_known)
     gapless = not gone.any() and not gaps_of(plain | below, OBJECT_GAP_PX, begin).any()
     if gapless and _is_whole(line.points, length):  # Nothing is left of the thread to look for.
-        ends_bare = is_bare_beyond(picture, gray, thread, parts[0], needle)
+        ends_bare = is_bare_beyond(seen, parts[0])
         end = PieceEnd.FREE if ends_bare else PieceEnd.UNKNOWN
-        whole = in_dish.piece(line, (PieceEnd.TAIL, end), (0.0, 0.0))
-        return ThreadObservation((whole,), complete=ends_bare, hidden=(_outline(needle, view),))
+        whole = seen.piece(line, (PieceEnd.TAIL, end), (0.0, 0.0))
+        return ThreadObservation((whole,), complete=ends_bare, hidden=(_outline(needle, picture.view),))
     if not search:
-        first = in_dish.piece(parts[0], (PieceEnd.TAIL, PieceEnd.UNKNOWN), (0.0, 0.0))
-        return ThreadObservation((first,), hidden=(_outline(needle, view),))
+        first = seen.piece(parts[0], (PieceEnd.TAIL, PieceEnd.UNKNOWN), (0.0, 0.0))
+        return ThreadObservation((first,), hidden=(_outline(needle, picture.view),))
     hiding = find_hiding(picture, needle)
     on_floor = np.array([hiding.area_at(point) == 0 for point in line.points])
     line = replace(line, visible=line.visible & on_floor)
@@ -123,70 +123,72 @@ def observe(
             fresh = fresh_parts(part.points[first : last + 1], known)
             known += [each for each in fresh if len(each) > MIN_LENGTH_PX]
     remaining = length * (1.0 + LENGTH_TOLERANCE) - sum(float(arc_lengths(each)[-1]) for each in known)
-    others = known[1:] + find_pieces(picture, gray, thread, hiding, known, remaining)
+    others = known[1:] + find_pieces(seen, hiding, known, remaining)
     strands = [begun]
     strands += [strand_along(gray, thread, respaced(other, SPACING_PX))[0] for other in others]
     ends, areas = [], []
     for number, strand in enumerate(strands):
-        first_end, first_area = (PieceEnd.TAIL, 0)
-        if number:
-            first_end, first_area = why_it_ends(picture, gray, thread, strand.turned(), needle, hiding)
-        last_end, last_area = why_it_ends(picture, gray, thread, strand, needle, hiding)
+        first_end, first_area = why_it_ends(seen, strand.turned(), hiding) if number else (PieceEnd.TAIL, 0)
+        last_end, last_area = why_it_ends(seen, strand, hiding)
         ends.append([first_end, last_end])
         areas.append((first_area, last_area))
-    return _joined(strands, ends, areas, hiding, in_dish, length)
+    return _joined(seen, strands, ends, areas, hiding, length)
 
 
 @dataclass(frozen=True)
-class _Dish:
-    """Turns pieces in pixels into those in the dish."""
+class _Seen:
+    """A picture with its needle and how its thread looks.
 
-    view: DishView
+    Attributes:
+        picture: the frame or a part of it.
+        gray: its darkest colour without the needle, smoothed.
+        needle: in the picture's pixels.
+        thread: how the piece looks that leaves the needle.
+        scale_known: whether the scale is given, so that it has no error.
+    """
+
+    picture: Picture
+    gray: Gray
+    needle: MeasuredNeedle
     thread: Appearance
     scale_known: bool
 
     def piece(
-        self,
-        strand: Strand,
-        ends: tuple[PieceEnd, PieceEnd],
-        arc_length: tuple[float, float],
-        confidence: float = 1.0,
-        *,
-        direction_known: bool = True,
+        self, strand: Strand, ends: tuple[PieceEnd, PieceEnd], arc_length: tuple[float, float], confidence: float = 1.0
     ) -> ThreadPiece:
-        """Return a piece; `arc_length` in pixels."""
-        scale = self.view.metres_per_pixel
-        points = self.view.to_dish(strand.points)
-        deviation = scale * deviations(self.thread, strand)
+        """Return a piece in the dish; `arc_length` in pixels, NaN where nothing tells it, nor the direction."""
+        view = self.picture.view
+        points = view.to_dish(strand.points)
+        deviation = view.metres_per_pixel * deviations(self.thread, strand)
         if not self.scale_known:  # A wrong scale shifts what is far from the dish's centre.
             along = tangents_of(points)
             deviation = np.hypot(deviation, 0.001 * (points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
-        low, high = (float(scale * value) for value in arc_length)
-        return ThreadPiece(points, deviation, *ends, (low, high), direction_known, confidence)
+        low, high = (float(view.metres_per_pixel * value) for value in arc_length)
+        return ThreadPiece(points, deviation, *ends, (low, high), not math.isnan(low), confidence)
 
 
 def _joined(
+    seen: _Seen,
     strands: list[Strand],
     ends: list[list[PieceEnd]],
     areas: list[tuple[int, int]],
     hiding: Hiding,
-    in_dish: _Dish,
     length: float,
 ) -> ThreadObservation:
     """Order the pieces.
 
     Args:
+        seen: the picture.
         strands: the one that leaves the needle first.
         ends: why each of them begins and ends; an end on bare floor stays free only if it is the thread's.
         areas: number of the hiding area that each end runs into, 0 for none.
         hiding: these areas.
-        in_dish: turns a strand into a piece.
         length: of the thread [px].
     """
     longest = length * (1.0 + LENGTH_TOLERANCE)
     lines = [strand.points for strand in strands]
     shortest = length * (1.0 - LENGTH_TOLERANCE)
-    order = find_order(lines, areas, hiding, (shortest, longest), in_dish.view.metres_per_pixel)
+    order = find_order(lines, areas, hiding, (shortest, longest), seen.picture.view.metres_per_pixel)
     # The only end on bare floor is the thread's where it is the last in the order, and the lengths add up.
     bare = [(number, side) for number, both in enumerate(ends) for side in (0, 1) if both[side] is PieceEnd.FREE]
     last = order[-1]
@@ -204,15 +206,12 @@ def _joined(
         if placed.index:
             low = max(0.0, low - LENGTH_ERROR * low - END_ERROR_PX)
             high = min(high + LENGTH_ERROR * high + END_ERROR_PX, max(low, longest - arc_lengths(strand.points)[-1]))
-        result.append(in_dish.piece(strand, (first_end, last_end), (low, high), placed.chance))
+        result.append(seen.piece(strand, (first_end, last_end), (low, high), placed.chance))
     unplaced = [number for number in range(len(strands)) if all(number != placed.index for placed in order)]
     for number in unplaced[:24]:  # more are texture
-        nowhere = (math.nan, math.nan)
-        result.append(
-            in_dish.piece(strands[number], (ends[number][0], ends[number][1]), nowhere, 0.3, direction_known=False)
-        )
+        result.append(seen.piece(strands[number], (ends[number][0], ends[number][1]), (math.nan, math.nan), 0.3))
     alone = len(strands) == 1 and ends[0][1] is PieceEnd.FREE and _is_whole(lines[0], length)
-    return ThreadObservation(tuple(result), alone, tuple(in_dish.view.to_dish(each) for each in hiding.outlines()))
+    return ThreadObservation(tuple(result), alone, tuple(seen.picture.view.to_dish(each) for each in hiding.outlines()))
 
 
 def _is_whole(line: Points, length: float) -> bool:
@@ -362,20 +361,11 @@ def two_sided_ridge(gray: Gray, thread: Appearance, hiding: Hiding) -> Gray:
     return np.ascontiguousarray(best)
 
 
-def find_pieces(
-    picture: Picture,
-    gray: Gray,
-    thread: Appearance,
-    hiding: Hiding,
-    known: list[Points],
-    max_length: float,
-) -> list[Points]:
+def find_pieces(seen: _Seen, hiding: Hiding, known: list[Points], max_length: float) -> list[Points]:
     """Find all other pieces of a thread.
 
     Args:
-        picture: the frame or a part of it.
-        gray: its darkest colour without the needle, smoothed.
-        thread: how the piece looks that leaves the needle.
+        seen: the picture.
         hiding: areas where nothing can be seen.
         known: pieces that are known, each of shape (m, 2) [px].
         max_length: of all these pieces: what is left of the thread, so that anything longer is none of it [px].
@@ -383,9 +373,10 @@ def find_pieces(
     Returns:
         Pieces in the picture's pixels, the longest first, each of shape (m, 2), m >= 2 [px].
     """
+    thread = seen.thread
     if max_length < MIN_LENGTH_PX or thread.strength < 2.0 * FAINTEST:  # The floor's texture looks like a faint thread.
         return []
-    ridge = two_sided_ridge(gray, thread, hiding)
+    ridge = two_sided_ridge(seen.gray, thread, hiding)
     ridge[~hiding.inside] = 0
     inside = hiding.inside[::5, ::5]
     noise = middle(ridge[::5, ::5][inside]) if inside.any() else 0.0
@@ -405,7 +396,7 @@ def find_pieces(
         cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
         for part in fresh_parts(line, known + found):
             long = MIN_LENGTH_PX <= arc_lengths(part)[-1] <= max_length
-            if long and looks_alike(picture, thread, part, 0.35):
+            if long and looks_alike(seen.picture, thread, part, 0.35):
                 found.append(part)
     return sorted(found, key=lambda line: -arc_lengths(line)[-1])
 
@@ -478,18 +469,11 @@ def end_direction(points: Points) -> Points:
     return np.asarray(direction / max(float(np.hypot(*direction)), 1e-9))
 
 
-def why_it_ends(
-    picture: Picture,
-    gray: Gray,
-    thread: Appearance,
-    strand: Strand,
-    needle: MeasuredNeedle,
-    hiding: Hiding,
-) -> tuple[PieceEnd, int]:
+def why_it_ends(seen: _Seen, strand: Strand, hiding: Hiding) -> tuple[PieceEnd, int]:
     """Tell why a piece ends at its last point, and the number of the area that it runs into, 0 for none."""
     point, way = strand.points[-1], end_direction(strand.points)
     aside = np.array([-way[1], way[0]])
-    rows, columns = gray.shape
+    rows, columns = seen.gray.shape
     for ahead in np.arange(0.0, 7.0 + 0.5):  # px
         for beside in (0.0, -1.5, 1.5):
             at = point + ahead * way + beside * aside
@@ -500,14 +484,14 @@ def why_it_ends(
                 return PieceEnd.FRAME, 0
             if area < 0:
                 return PieceEnd.UNKNOWN, 0
-    return (PieceEnd.FREE if is_bare_beyond(picture, gray, thread, strand, needle) else PieceEnd.UNKNOWN), 0
+    return (PieceEnd.FREE if is_bare_beyond(seen, strand) else PieceEnd.UNKNOWN), 0
 
 
-def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Strand, needle: MeasuredNeedle) -> bool:
+def is_bare_beyond(seen: _Seen, strand: Strand) -> bool:
     """Say whether there is nothing but floor beyond a piece's last point, like that beside it, where it is strong."""
     if len(strand.points) < BESIDE_POINTS:
         return False
-    usual = float(median(strand.strength[-BESIDE_POINTS:]))
+    gray, thread, usual = seen.gray, seen.thread, float(median(strand.strength[-BESIDE_POINTS:]))
     if usual < max(2.0 * FAINTEST, 4.0 * thread.noise):
         return False
     point, way = strand.points[-1], end_direction(strand.points)
@@ -517,7 +501,7 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
     rows, columns = gray.shape
     if ahead.min() < 2.0 or (ahead > np.array([columns, rows]) - 3.0).any():
         return False
-    if below_needle(needle, ahead.reshape(-1, 2)).any():
+    if below_needle(seen.needle, ahead.reshape(-1, 2)).any():
         return False
     aside = thread.beside_px + np.array([0.5, 1.5, 2.5])
     last = strand.points[-BESIDE_POINTS - 1 :]  # with one more, for the direction at the first
@@ -526,7 +510,7 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
     floor, beyond = float(median(sampled(gray, beside).ravel())), sampled(gray, ahead)
     if floor - float(beyond[1:].min()) > max(0.5 * usual, FAINTEST + 3.0 * thread.noise):  # It goes on.
         return False
-    light = np.vstack([median(np.atleast_3d(sampled(picture.image, at)), axis=1) for at in (beside, ahead)])
+    light = np.vstack([median(np.atleast_3d(sampled(seen.picture.image, at)), axis=1) for at in (beside, ahead)])
     light /= np.maximum(median(light[: len(beside)], axis=0), 1.0)
     mean = light.mean(axis=1)
     step = np.abs(_off_line() @ mean).max()
