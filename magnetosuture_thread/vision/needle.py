@@ -158,7 +158,7 @@ def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
 def measure_needle(
     steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.ndarray | None = None
 ) -> MeasuredNeedle | str:
-    """Measure the needle near a rough fit.
+    """Fit near a rough fit to the end, in both directions; return the needle if all looks like one, in one direction.
 
     Args:
         steel: the image around it.
@@ -171,18 +171,7 @@ def measure_needle(
     """
     if rough.cost > HOPELESS * MAX_COST * size.length_px:
         return NO_SHAPE
-    found = _checked(steel, rough.arc, size, toward)
-    if not isinstance(found, MeasuredNeedle):
-        return found
-    found = found.shifted(steel.origin)
-    corners = found.arc.at(np.array([0.0, found.length_px]))
-    if corners.min() < 3.0 or (corners > np.array(steel.size) - 4.0).any():
-        return "cut by the image's border"
-    return found
-
-
-def _checked(steel: SteelMap, guess: Arc, size: NeedleSize, toward: np.ndarray | None) -> MeasuredNeedle | str:
-    """Fit to the end, in both directions; return the needle if all looks like one, in one direction."""
+    guess = rough.arc
     width = size.width_px
     one, other, rod = _fits(steel, guess, size, size.tolerance)
     best = min((one, other, rod), key=lambda each: each.cost)
@@ -250,7 +239,11 @@ def _checked(steel: SteelMap, guess: Arc, size: NeedleSize, toward: np.ndarray |
         direction_is_clear=is_clear,
         told_by_line=is_line,
     )
-    return needle if is_known else needle.undirected()
+    needle = (needle if is_known else needle.undirected()).shifted(steel.origin)
+    ends = needle.arc.at(np.array([0.0, needle.length_px]))
+    if ends.min() < 3.0 or (ends > np.array(steel.size) - 4.0).any():
+        return "cut by the image's border"
+    return needle
 
 
 def _fits(
