@@ -22,7 +22,6 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings, scaled_h
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
-MAX_TILT = math.radians(35.0)
 MAX_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
 
@@ -65,14 +64,8 @@ class Calibration:
             "camera_rotation": round(float(self.view.rotation), 6),
         }
         usual = VisionTrackerSettings()
-        for name in (
-            "region_px",
-            "rim",
-            "max_needle_brightness",
-            "needle_colour",
-            "needle_is_blunt",
-            "max_needle_bend",
-        ):
+        looks = ("max_needle_brightness", "needle_colour", "needle_is_blunt", "max_needle_bend")
+        for name in ("region_px", "rim", *looks):
             value = getattr(self.looked, name)
             if value != getattr(usual, name):
                 values[name] = [round(each, 4) for each in value] if isinstance(value, tuple) else value
@@ -194,11 +187,11 @@ def calibrate_by_markers(
         InvalidInputError: no images, images of different sizes, a marker that no image shows, markers that
             differ from frame to frame, corners that no overhead camera sees so, or OpenCV is older than 4.7.
     """
-    grays = _grays(images)
+    _check_images(images)
     detector = _detector()
     seen: dict[int, list[np.ndarray]] = {index: [] for index in range(4)}
-    for gray in grays:
-        corners, ids, _ = detector.detectMarkers(gray)
+    for image in images:
+        corners, ids, _ = detector.detectMarkers(measured_channel(image))
         for at, index in zip(corners, [] if ids is None else ids.ravel(), strict=True):
             if int(index) in seen:
                 seen[int(index)].append(at.reshape(4, 2).astype(float))
@@ -221,7 +214,7 @@ def calibrate_by_markers(
     if residual > MAX_RESIDUAL_PX:
         expected = f"at most {MAX_RESIDUAL_PX} px, from a camera above markers at these distances"
         raise InvalidInputError("frames", f"marker corners off by {residual:.2f} px", expected)
-    return Calibration(view, len(grays), residual, scatter, dish_diameter, homography)
+    return Calibration(view, len(images), residual, scatter, dish_diameter, homography)
 
 
 def _check_scatter(what: str, scatter_px: float) -> None:
@@ -233,9 +226,8 @@ def _check_scatter(what: str, scatter_px: float) -> None:
 
 def _detector() -> cv2.aruco.ArucoDetector:
     if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
-        raise InvalidInputError(
-            "markers", f"OpenCV {cv2.__version__}", "OpenCV 4.7 or newer, which is needed for markers"
-        )
+        expected = "OpenCV 4.7 or newer, which is needed for markers"
+        raise InvalidInputError("markers", f"OpenCV {cv2.__version__}", expected)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
@@ -255,7 +247,7 @@ def _similarity(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, float
 def _homography(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, np.ndarray, float] | None:
     """Return the view at the dish's centre, what straightens a frame, and the root of the mean square error [px].
 
-    None where the camera would be tilted by more than `MAX_TILT`, by the ratio of the scales at the centre.
+    None where the camera would be tilted by more than 35 degrees, by the ratio of the scales at the centre.
     """
     seen, _ = cv2.findHomography(points / np.abs(points).max(), pixels)
     if seen is None or abs(seen[2, 2]) < 1e-9:
@@ -265,7 +257,7 @@ def _homography(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, np.nd
     slope = (seen[:2, :2] - np.outer(centre, seen[2, :2])) / seen[2, 2]
     u, scales, v = np.linalg.svd(slope * ((1.0,), (-1.0,)))  # image v goes down
     turn = u @ v
-    if np.linalg.det(turn) < 0.0 or scales[1] < math.cos(MAX_TILT) * scales[0]:
+    if np.linalg.det(turn) < 0.0 or scales[1] < math.cos(math.radians(35.0)) * scales[0]:
         return None
     rotation = math.atan2(turn[1, 0], turn[0, 0])
     view = DishView((float(centre[0]), float(centre[1])), 1.0 / math.sqrt(scales[0] * scales[1]), rotation)
@@ -275,11 +267,6 @@ def _homography(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, np.nd
     residual = float(np.sqrt(np.mean(np.sum((found[:, :2] / found[:, 2:] - pixels) ** 2, axis=1))))
     homography = straight @ np.linalg.inv(seen)
     return view, homography / homography[2, 2], residual
-
-
-def _grays(images: Sequence[np.ndarray]) -> list[np.ndarray]:
-    _check_images(images)
-    return [measured_channel(image) for image in images]
 
 
 def _check_images(images: Sequence[np.ndarray]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, sampled_channel, shrunk
+from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, shrunk
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSettings
 
 COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
@@ -710,9 +710,11 @@ class DishWatch:
             return "", self.found.prepared(image)
         prepared = self.found.prepared(image)
         view = self.found.view
-        shift, rays = rim_shift(prepared, view.centre_px, 0.5 * self._diameter / view.metres_per_pixel)
+        radius = 0.5 * self._diameter / view.metres_per_pixel
+        edges, darkest = rim_points(prepared, view.centre_px, radius, 7.0, 1.0, BINS)
+        circle = fit_circle(darkest if len(darkest) >= len(edges) // 2 else edges, 0.5 * AGREEMENT_PX)
         before, self._anew = self._anew, []
-        if rays >= 0.4 * BINS and shift < 1.0:  # px
+        if circle is not None and circle[3] >= 0.4 * BINS and math.dist(circle[:2], view.centre_px) < 1.0:  # px
             return "", prepared
         found = see_dish(image, self._settings, self._diameter)
         if found is None:
@@ -735,23 +737,6 @@ class DishWatch:
         return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(0.005, slack)
 
 
-def rim_shift(image: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:
-    """Look quickly whether the rim is where it was.
-
-    Args:
-        image: frame, shape (rows, columns) or (rows, columns, 3), uint8.
-        centre: the dish's centre [px].
-        radius: and its radius [px].
-
-    Returns:
-        How far the circle through the rim's darkest ring has moved since [px], and how many of the `BINS` rays
-        agree on it.
-    """
-    edges, darkest = rim_points(image, centre, radius, 7.0, 1.0, BINS)
-    circle = fit_circle(darkest if len(darkest) >= len(edges) // 2 else edges, 0.5 * AGREEMENT_PX)
-    return (math.dist(circle[:2], centre), circle[3]) if circle is not None else (0.0, 0)
-
-
 def rim_points(
     image: np.ndarray, centre: tuple[float, float], radius: float, reach: float, step: float, rays: int
 ) -> tuple[Points, Points]:
@@ -770,7 +755,8 @@ def rim_points(
     """
     ways, count = unit_vectors(rays), int(2.0 * reach / step)
     radii, places = radius - reach + step * np.arange(count), np.arange(count)
-    profiles = sampled_channel(image, centre + radii[:, None] * ways[:, None])
+    profiles = sampled(image, centre + radii[:, None] * ways[:, None])
+    profiles = profiles[..., 1] if image.ndim == 3 else profiles  # To extract the channel first takes longer.
     inside, dark = median(profiles[:, : max(3, count // 8)], axis=1), profiles.min(axis=1)
     half = 0.5 * (inside + dark)
     index = (profiles < half[:, None]).argmax(axis=1)

@@ -452,11 +452,6 @@ def _square(reach: int) -> Points:
     return np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - float(reach)
 
 
-def sampled_channel(image: np.ndarray, points: Points) -> NDArray[np.float64]:
-    """Return the channel to measure on at points; of few of them, as to extract the channel takes longer."""
-    return sampled(image, points)[..., 1] if image.ndim == 3 else sampled(image, points)
-
-
 def middle(values: np.ndarray) -> float:
     """Return the median of values of any shape, the upper one of two; numpy's own takes ten times as long."""
     ordered = values.astype(np.result_type(values, np.float32)).ravel()  # numpy sorts bytes four times as slowly

@@ -41,8 +41,7 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
     Returns:
         A new BGR image of the same size.
     """
-    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
-    unit = max(1, round(min(drawn.shape[:2]) / 480))
+    drawn, unit = _canvas(image)
     view = track.view
     if view is not None:
         _circle(drawn, np.asarray(view.centre_px), 2.5 * unit, DISH, -1)
@@ -64,6 +63,12 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
     return drawn
 
 
+def _canvas(image: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return a BGR image to draw over, a copy, and the width of a line for its size [px]."""
+    drawn = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
+    return drawn, max(1, round(min(drawn.shape[:2]) / 480))
+
+
 def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:
     """Draw the dish's circle into a BGR image."""
     _circle(image, np.asarray(centre_px), radius_px, DISH, 1)
@@ -83,8 +88,7 @@ def draw_taught(image: np.ndarray, taught: Taught) -> np.ndarray:
 
     Its best answer is in the needle's colour with its score, all others are in that of refused things.
     """
-    frame = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
-    unit = max(1, round(min(frame.shape[:2]) / 480))
+    frame, unit = _canvas(image)
     mask = cv2.cvtColor(taught.dark, cv2.COLOR_GRAY2BGR)
     mask[taught.dark == 0] = DISH  # where nothing is looked for
     for index, (ends, score) in enumerate(taught.answers):
