@@ -188,7 +188,12 @@ def calibrate_by_markers(
             differ from frame to frame, corners that no overhead camera sees so, or OpenCV is older than 4.7.
     """
     _check_images(images)
-    detector = _detector()
+    if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
+        expected = "OpenCV 4.7 or newer, which is needed for markers"
+        raise InvalidInputError("markers", f"OpenCV {cv2.__version__}", expected)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
     seen: dict[int, list[np.ndarray]] = {index: [] for index in range(4)}
     for image in images:
         corners, ids, _ = detector.detectMarkers(measured_channel(image))
@@ -222,15 +227,6 @@ def _check_scatter(what: str, scatter_px: float) -> None:
     if scatter_px > MAX_SCATTER_PX:
         expected = f"a camera that stands still: at most {MAX_SCATTER_PX} px"
         raise InvalidInputError("frames", f"{what} that differ by {scatter_px:.2f} px", expected)
-
-
-def _detector() -> cv2.aruco.ArucoDetector:
-    if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
-        expected = "OpenCV 4.7 or newer, which is needed for markers"
-        raise InvalidInputError("markers", f"OpenCV {cv2.__version__}", expected)
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
 
 
 def _similarity(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, float]:

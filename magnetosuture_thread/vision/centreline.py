@@ -243,16 +243,14 @@ def find_arms(ridge: Ridge, part: NDArray[np.float64]) -> list[Arm]:
         score = np.minimum(sampled(ridge.strength, places) - ridge.noise, STRONGEST * usual).mean(axis=0)
         score[ways @ outward < 0.0] = -np.inf
         arm = _arm(ridge, start, float(turns[np.argmax(score)]), usual)
-        if arm is None or _stays(arm, part[:, :2]) or any(other.covers(arm.start) for other in arms):
+        if arm is None:
+            continue
+        away = np.sqrt(((arm.path[:7, None, :2] - part[:, :2]) ** 2).sum(axis=2).min(axis=1))
+        # One that leads back into the crossing does not leave it.
+        if away[-1] < away[0] or any(other.covers(arm.start) for other in arms):
             continue
         arms = [other for other in arms if not arm.covers(other.start)] + [arm]
     return sorted(arms, key=lambda arm: -arm.strength)[:8]
-
-
-def _stays(arm: Arm, points: Points) -> bool:
-    """Say whether an arm leads back into the crossing instead of away from it."""
-    away = np.sqrt(((arm.path[:7, None, :2] - points) ** 2).sum(axis=2).min(axis=1))
-    return bool(away[-1] < away[0])
 
 
 def _edge_around(points: Points) -> Points:

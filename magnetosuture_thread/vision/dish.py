@@ -102,15 +102,7 @@ class _Edges:
     shape: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class Ring:
-    """An edge of a dish's wall or lid: its ellipse [px], and the share of the directions in which it is seen."""
-
-    ellipse: Ellipse
-    support: float
-
-
-def find_rings(image: np.ndarray) -> list[Ring]:
+def find_rings(image: np.ndarray) -> list[Ellipse]:
     """Find the edges of a dish's wall and lid by gradients alone, the smallest first.
 
     In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
@@ -139,11 +131,10 @@ def find_rings(image: np.ndarray) -> list[Ring]:
     gray, first = shrunk(measured_channel(image), factor), at.scaled(1.0 / factor)
     radius = 0.5 * (first.major + first.minor)  # It may lie across several, and look tilted by that.
     sets = [_rings_around(gray, each) for each in (first, replace(first, major=radius, minor=radius))]
-    sets += [_rings_around(gray, max(each, key=lambda ring: ring.support).ellipse) for each in sets if each]
+    sets += [_rings_around(gray, max(each, key=lambda ring: ring[0])[1]) for each in sets if each]
     # Strong rings speak for an ellipse; weak ones are there by chance.
-    rings = max(sets, key=lambda each: sum(ring.support**4 for ring in each))
-    rings = [replace(ring, ellipse=ring.ellipse.scaled(float(factor))) for ring in rings]
-    return sorted(rings, key=lambda ring: ring.ellipse.major)
+    rings = max(sets, key=lambda each: sum(support**4 for support, _ in each))
+    return sorted((ring.scaled(float(factor)) for _, ring in rings), key=lambda ring: ring.major)
 
 
 @dataclass(frozen=True)
@@ -209,8 +200,8 @@ def _within(points: Points, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(((points >= 1.0) & (points <= np.array(shape[1::-1]) - 2.0)).all(axis=-1))
 
 
-def _rings_around(gray: Gray, at: Ellipse) -> list[Ring]:
-    """Find the edges of wall and lid near an ellipse.
+def _rings_around(gray: Gray, at: Ellipse) -> list[tuple[float, Ellipse]]:
+    """Find the edges of wall and lid near an ellipse, each with the share of the directions in which it is seen.
 
     They are circles one above the other: in units of the ellipse's axes each is nearly a circle, shifted by what the
     camera sees of its height. The one that most changes of the light agree on is fitted by an ellipse and taken out,
@@ -218,7 +209,7 @@ def _rings_around(gray: Gray, at: Ellipse) -> list[Ring]:
     """
     steps = _Steps.around(gray, at)
     points = at.at(steps.radius[:, None] * unit_vectors(RAYS)[steps.way])
-    left, found = np.ones(len(steps.way), np.bool_), list[Ring]()
+    left, found = np.ones(len(steps.way), np.bool_), list[tuple[float, Ellipse]]()
     for _ in range(10):  # edges of wall and lid
         begin, own, votes = steps.most_agreed(left)
         left &= ~own
@@ -233,7 +224,7 @@ def _rings_around(gray: Gray, at: Ellipse) -> list[Ring]:
         outline = ellipse.seen(gray.shape, RAYS)
         support = min(1.0, len(agree) / max(1, int(outline.sum())))
         if support >= SUPPORT + 0.5 * (1.0 - float(outline.mean())):
-            found.append(Ring(ellipse, support))
+            found.append((support, ellipse))
     return found
 
 
@@ -551,7 +542,7 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
         radius, error = 0.5 * diameter / fixed.metres_per_pixel, settings.scale_error
         if 2.0 * radius < MIN_SIDE_PX:
             return None
-        ring = Ring(Ellipse(fixed.centre_px, radius, radius, 0.0), 1.0)
+        ring = Ellipse(fixed.centre_px, radius, radius, 0.0)
         dark = middle(gray[::8, ::8]) < DARK_FLOOR and _by_wall(gray, [ring], settings, diameter, True) is not None
         return FoundDish(fixed, dark, None, error, remark=_scale_remark(error), homography=settings.homography())
     rings = find_rings(image)
@@ -563,7 +554,7 @@ def see_dish(image: np.ndarray, settings: VisionTrackerSettings, diameter: float
 
 
 def _by_wall(
-    gray: Gray, rings: list[Ring], settings: VisionTrackerSettings, diameter: float, dark_field: bool
+    gray: Gray, rings: list[Ellipse], settings: VisionTrackerSettings, diameter: float, dark_field: bool
 ) -> FoundDish | None:
     """Return the dish by a wall as dark as steel, of a dark floor as bright; None unless both of its sides are seen.
 
@@ -571,7 +562,7 @@ def _by_wall(
     and the tilt. All other rings lie at the wall, and beyond it the ground is bright again: a clear dish on a dark
     bench looks the same from the inside.
     """
-    light, guess = (255 - gray if dark_field else gray), rings[0].ellipse
+    light, guess = (255 - gray if dark_field else gray), rings[0]
     centre, radius = guess.centre_px, 0.5 * (guess.major + guess.minor)
     edges, darkest, count = np.empty((0, 2)), np.empty((0, 2)), 0
     for reach, step in ((0.12, 1.0), (0.04, 0.5)):  # in shares of the radius: by a first guess, and once it is known
@@ -585,7 +576,7 @@ def _by_wall(
     spread = np.hypot(*oval.coordinates(darkest).T) - 1.0
     spread = spread[np.abs(spread) < FINE_AGREEMENT]
     needed = SUPPORT * seen.sum()
-    shares, farthest = [each.ellipse.major / radius for each in rings], 1.0 + 2.0 * WALL / diameter
+    shares, farthest = [each.major / radius for each in rings], 1.0 + 2.0 * WALL / diameter
     beyond = replace(inner, major=farthest * radius, minor=farthest * radius).at(unit_vectors(RAYS))
     beyond = beyond[_within(beyond, gray.shape)]
     if max(count, len(spread)) < needed or seen.mean() < 0.4 or not len(darkest) or not len(beyond):
@@ -615,15 +606,15 @@ def _by_wall(
     return FoundDish(view, dark_field, None, error, unseen)
 
 
-def _by_ring(gray: Gray, rings: list[Ring], settings: VisionTrackerSettings, diameter: float) -> FoundDish:
+def _by_ring(gray: Gray, rings: list[Ellipse], settings: VisionTrackerSettings, diameter: float) -> FoundDish:
     """Return the dish by one of its rings; where none was named, all of them make the doubt of the scale."""
-    edge = rings[-1 if settings.rim == "outer" else 0].ellipse
+    edge = rings[-1 if settings.rim == "outer" else 0]
     tilt, radius, unseen = tilt_of(edge), edge.major, MIN_ANGLE
     error = RING_ERROR
     if len(rings) == 1:
         error = max(error, WALL / diameter)
     elif not settings.rim:
-        error = max(error, *(abs(ring.ellipse.major / radius - 1.0) for ring in rings))
+        error = max(error, *(abs(ring.major / radius - 1.0) for ring in rings))
     is_cut = not edge.seen(gray.shape, RAYS).all()
     if tilt is not None and (is_cut or not _is_confirmed(tilt, radius, rings)):
         # One edge that is no circle may be a tilted one, or two edges of which each is seen in a part.
@@ -634,9 +625,9 @@ def _by_ring(gray: Gray, rings: list[Ring], settings: VisionTrackerSettings, dia
     return FoundDish(view, dark_field, tilt, error, unseen if tilt is None else 0.0)
 
 
-def _is_confirmed(tilt: Tilt, radius: float, rings: list[Ring]) -> bool:
+def _is_confirmed(tilt: Tilt, radius: float, rings: list[Ellipse]) -> bool:
     """Say whether another ring than that of a radius [px] has the same tilt."""
-    others = (tilt_of(ring.ellipse) for ring in rings if abs(ring.ellipse.major / radius - 1.0) > AGREEMENT)
+    others = (tilt_of(ring) for ring in rings if abs(ring.major / radius - 1.0) > AGREEMENT)
     return any(other is not None and tilt.apart(other) < TILT_ERROR for other in others)
 
 

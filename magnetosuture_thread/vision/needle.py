@@ -90,15 +90,8 @@ def _axis_alone(candidate: Candidate, size: NeedleSize) -> MeasuredNeedle:
     aside = 0.2 * size.width_px  # one deviation
     along = math.hypot(aside, 0.5 * size.tolerance * size.length_px)
     covariance = np.diag([along, aside, 2.0 * math.sqrt(3.0) * aside / size.length_px]) ** 2
-    confidence = 0.5 * candidate.score
-    return MeasuredNeedle(
-        candidate.arc,
-        size.length_px,
-        size.width_px,
-        confidence=confidence,
-        covariance=covariance,
-        direction_is_clear=False,
-    )
+    needle = MeasuredNeedle(candidate.arc, size.length_px, size.width_px, direction_is_clear=False)
+    return replace(needle, confidence=0.5 * candidate.score, covariance=covariance)
 
 
 def _rough_fits(steel: SteelMap, candidate: Candidate, size: NeedleSize) -> list[TemplateFit]:
@@ -191,8 +184,10 @@ def measure_needle(
     length_error = 0.5 * (min(size.tolerance, max(SAME_LENGTH, apart)) if agrees else size.tolerance)
     if reason := _what_covers(steel, shown, best):
         return reason
-    if steel.share_hidden(best.arc, best.length) > 0.02:
-        return "hidden"
+    if steel.hidden is not None:
+        points = best.arc.at(best.length / 99.0 * np.arange(100.0))
+        if nearest(steel.hidden, points).mean() > 0.02:
+            return "hidden"
     if abs(best.arc.curvature) * best.length > size.max_bend + 0.2:  # rad; error of a drawn needle's bend
         return "bent too far"
     excess = _excess(steel.surely, best, width)

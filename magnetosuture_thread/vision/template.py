@@ -73,12 +73,6 @@ class SteelMap:
         hidden = hidden if self.hidden is None else self.hidden | hidden
         return replace(self, surely=surely, perhaps=perhaps, hidden=hidden)
 
-    def share_hidden(self, arc: Arc, length: float) -> float:
-        """Return which share of an arc of a length, in the map's own pixels, is hidden."""
-        if self.hidden is None:
-            return 0.0
-        return float(nearest(self.hidden, arc.at(length / 99.0 * np.arange(100.0))).mean())
-
     def is_glaring(self, points: np.ndarray) -> bool:
         """Say whether the lamp is reflected within a few pixels of points, in the map's own pixels, shape (m, 2)."""
         return float(greatest_near(self.light, points, GLARE_REACH_PX).max()) > GLARE
