@@ -119,20 +119,24 @@ def scene_mask(scene: Scene, view: DishView, shape: tuple[int, ...], tolerance: 
     if not scene.shapes:
         return None
     rows, columns = shape[:2]
-    inside = np.zeros((rows, columns), np.uint8)
-    for geometry in scene.obstacles:  # One after the other: shapes may overlap, and even-odd filling would undo it.
-        own = np.zeros_like(inside)
-        rings = [np.round(view.to_pixels(ring) * 16.0).astype(np.int32) for ring in mask_outlines(geometry)]
-        cv2.fillPoly(own, rings, 255, cv2.LINE_8, 4)
+    inside, rim = np.zeros((rows, columns), np.uint8), list[Points]()
+    for index, geometry in enumerate(scene.obstacles):
+        rings = [view.to_pixels(ring) for ring in _outlines(geometry)]
+        own = np.zeros_like(inside)  # Shapes may overlap, and even-odd filling of all at once would undo it.
+        cv2.fillPoly(own, [np.round(ring * 16.0).astype(np.int32) for ring in rings], 255, cv2.LINE_8, 4)
         cv2.bitwise_or(inside, own, inside)
+        for ring in rings:
+            closed = np.vstack([ring, ring[:1]])
+            points = points_at(closed, np.arange(0.0, arc_lengths(closed)[-1], 4.0))
+            rim.append(np.column_stack([points, np.full(len(points), float(index))]))
     # Filling takes every pixel that an edge touches: half a pixel too many, as blur makes a dark shape look too.
     depth = _distance(inside) - _distance(cv2.bitwise_not(inside))
     cells = cv2.resize(inside, (max(2, columns // CELL_PX), max(2, rows // CELL_PX)), interpolation=cv2.INTER_AREA)
     floor_cells = _nearest_uncovered(cells > 0.1 * 255.0)
-    return SceneMask(depth, tolerance / view.metres_per_pixel, _rim(scene, view), floor_cells)
+    return SceneMask(depth, tolerance / view.metres_per_pixel, np.vstack(rim), floor_cells)
 
 
-def mask_outlines(geometry: Disc | Polygon) -> list[Points]:
+def _outlines(geometry: Disc | Polygon) -> list[Points]:
     """Return the rings of a shape, a disc as a polygon, each of shape (m, 2) [m]."""
     if isinstance(geometry, Disc):
         turn = np.linspace(0.0, 2.0 * np.pi, 128, endpoint=False)
@@ -152,17 +156,6 @@ def _nearest_uncovered(covered: NDArray[np.bool_]) -> NDArray[np.int16]:
     owner = np.zeros((int(labels.max()) + 1, 2), np.int16)
     owner[labels[~covered]] = itself[~covered]
     return owner[labels]
-
-
-def _rim(scene: Scene, view: DishView) -> Points:
-    """Return points along all outlines, with the index of their shape, shape (m, 3) [px]."""
-    parts = []
-    for index, geometry in enumerate(scene.obstacles):
-        for ring in mask_outlines(geometry):
-            closed = view.to_pixels(np.vstack([ring, ring[:1]]))
-            points = points_at(closed, np.arange(0.0, arc_lengths(closed)[-1], 4.0))
-            parts.append(np.column_stack([points, np.full(len(points), float(index))]))
-    return np.vstack(parts)
 
 
 def _distance(inside: Gray) -> NDArray[np.float32]:

@@ -148,11 +148,7 @@ class OverlayWriter:
             image: BGR, uint8; in a video, a picture of another size than the first is fitted into it.
         """
         if self._path.suffix.lower() not in VIDEOS:
-            file = self._path / f"{name}.png"
-            if problem := output_problem(file):
-                raise BagError(file, problem)
-            if not cv2.imwrite(str(file), image):
-                raise BagError(file, "cannot be written")
+            write_png(self._path / f"{name}.png", image)
             return
         if self._video is None:
             self._size = (image.shape[1] // 2 * 2, image.shape[0] // 2 * 2)  # which every codec takes
