@@ -315,9 +315,7 @@ def _is_reference(path: Path) -> bool:
 def evaluate_references(options: argparse.Namespace, log: Log, progress: Progress) -> reference.Evaluation:
     """Score reference trajectories as the options say; write table.json and a picture of each into --output, if any."""
     paths = [path for folder in options.paths for path in reference.find_references(folder)]
-    cases: list[reference.CaseResult] = []
     settings: dict[str, Any] = {"segments": options.segments, "progress": progress}
-    settings["keep"] = cases.append if options.output is not None else lambda case: None
     with ExitStack() as stack:
         folder = stack.enter_context(whole_folder(options.output)) if options.output is not None else None
         if options.rig:
@@ -328,7 +326,7 @@ def evaluate_references(options: argparse.Namespace, log: Log, progress: Progres
         if folder is not None:
             document = evaluation.to_mapping()
             tables.write_table(folder / "table.json", document["cases"], document)
-            for case in cases:
+            for case in evaluation.results:
                 if picture := picture_or_log(partial(_draw_case, case, evaluation.formulation), log):
                     (folder / f"{one_line(case.score.name).replace('/', '_')}.png").write_bytes(picture)
     return evaluation

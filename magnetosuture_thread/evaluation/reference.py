@@ -133,36 +133,6 @@ class CaseScore:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """The scores of a set of trajectories, simulated ones unless their metadata names another source.
-
-    Attributes:
-        formulation: its name.
-        solver: its name.
-        cases: one score for each trajectory.
-    """
-
-    formulation: str
-    solver: str
-    cases: tuple[CaseScore, ...]
-
-    @property
-    def mean_error_percent(self) -> float:
-        """Mean over the cases."""
-        return float(np.mean([case.mean_error_percent for case in self.cases]))
-
-    @property
-    def worst_error_percent(self) -> float:
-        """The largest mean of a case."""
-        return max(case.mean_error_percent for case in self.cases)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return what goes into JSON."""
-        errors = {"mean_error_percent": self.mean_error_percent, "worst_error_percent": self.worst_error_percent}
-        return {**asdict(self), "cases": [asdict(case) for case in self.cases], **errors}
-
-
-@dataclass(frozen=True)
 class CaseResult:
     """One evaluated trajectory over time.
 
@@ -188,6 +158,46 @@ class CaseResult:
         return metrics
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """The results of a set of trajectories, simulated ones unless their metadata names another source.
+
+    Attributes:
+        formulation: its name.
+        solver: its name.
+        results: one for each trajectory.
+    """
+
+    formulation: str
+    solver: str
+    results: tuple[CaseResult, ...]
+
+    @property
+    def cases(self) -> list[CaseScore]:
+        """The score of each trajectory."""
+        return [result.score for result in self.results]
+
+    @property
+    def mean_error_percent(self) -> float:
+        """Mean over the cases."""
+        return float(np.mean([case.mean_error_percent for case in self.cases]))
+
+    @property
+    def worst_error_percent(self) -> float:
+        """The largest mean of a case."""
+        return max(case.mean_error_percent for case in self.cases)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what goes into JSON."""
+        return {
+            "formulation": self.formulation,
+            "solver": self.solver,
+            "cases": [asdict(case) for case in self.cases],
+            "mean_error_percent": self.mean_error_percent,
+            "worst_error_percent": self.worst_error_percent,
+        }
+
+
 def find_references(folder: Path) -> list[Path]:
     """Return the trajectories of a folder, in the order of their names.
 
@@ -202,14 +212,25 @@ def find_references(folder: Path) -> list[Path]:
     return paths
 
 
+class Simulation(NamedTuple):
+    """A thread at the first sample of a trajectory, and what moves it on.
+
+    Attributes:
+        initial: the thread, shape (n + 1, 2) [m].
+        length: of the thread [m].
+        diameter: of the thread [m].
+        step: goes to a sample, given by its index; returns the thread, shape (n + 1, 2) [m], the greatest strain of a
+            segment, the residual, and the number of fallbacks, see `CaseScore`.
+    """
+
+    initial: Points
+    length: float
+    diameter: float
+    step: Callable[[int], tuple[Points, float, float, int]]
+
+
 def score(
-    paths: Sequence[Path],
-    *,
-    formulation: str,
-    solver: str,
-    segments: int | None = None,
-    progress: Progress,
-    keep: Callable[[CaseResult], None] = lambda result: None,
+    paths: Sequence[Path], *, formulation: str, solver: str, segments: int | None = None, progress: Progress
 ) -> Evaluation:
     """Score a formulation on trajectories: each with its own thread and parameters, nothing tuned for a case.
 
@@ -219,14 +240,13 @@ def score(
         solver: its name.
         segments: n, of all cases; without it each case has the paper's.
         progress: called with the share done, 0 to 1.
-        keep: called with each case's result.
 
     Raises:
         BagError: a file is no reference trajectory.
         SolverError: a step could not be solved.
     """
 
-    def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
+    def begin(reference: ReferenceTrajectory, path: Path) -> Simulation:
         thread, paper = reference_thread(reference, path, segments)
         workspace = Workspace(reference.discs, 3e-3)  # m; within this of an obstacle, depths are looked at
         predictor = ThreadPredictor(
@@ -238,105 +258,17 @@ def score(
         initial = resampled(reference.threads[0], thread.segments)
         predictor.start_at(poses[0], initial)
 
-        def step(index: int) -> StepFigures:
+        def step(index: int) -> tuple[Points, float, float, int]:
             prediction = predictor.step(poses[index])
-            strain, is_fallback = float(prediction.strain.max()), prediction.status != SOLVED
-            return StepFigures(prediction.positions, strain, prediction.residual, int(is_fallback))
+            is_fallback = prediction.status != SOLVED
+            return prediction.positions, float(prediction.strain.max()), prediction.residual, int(is_fallback)
 
-        return run_case(reference, initial, thread.length, thread.diameter, step, share)
+        return Simulation(initial, thread.length, thread.diameter, step)
 
-    return Evaluation(formulation, solver, _score_each(paths, score_case, progress, keep))
-
-
-def _score_each(
-    paths: Sequence[Path],
-    score_case: Callable[[ReferenceTrajectory, Path, Progress], CaseResult],
-    progress: Progress,
-    keep: Callable[[CaseResult], None],
-) -> tuple[CaseScore, ...]:
-    """Score trajectories one after another; progress is called with the share of all that is done."""
-    scores = []
-    for index, path in enumerate(paths):
-
-        def share(part: float, done: int = index) -> None:
-            progress((done + part) / len(paths))
-
-        result = score_case(read_reference(path), path, share)
-        scores.append(result.score)
-        keep(result)
-    return tuple(scores)
+    return Evaluation(formulation, solver, _run_cases(paths, begin, progress))
 
 
-class StepFigures(NamedTuple):
-    """Figures of one step of a simulated or predicted thread.
-
-    Attributes:
-        vertices: of the thread, shape (n + 1, 2) [m].
-        strain: greatest of a segment.
-        residual: of the solve.
-        fallbacks: of it; see `CaseScore`.
-    """
-
-    vertices: Points
-    strain: float
-    residual: float
-    fallbacks: int
-
-
-def run_case(
-    reference: ReferenceTrajectory,
-    initial: Points,
-    length: float,
-    diameter: float,
-    step: Callable[[int], StepFigures],
-    progress: Progress,
-) -> CaseResult:
-    """Step a thread along a reference trajectory and score it.
-
-    Args:
-        reference: the trajectory.
-        initial: the thread at its first sample, shape (n + 1, 2) [m].
-        length: of the thread [m].
-        diameter: of the thread [m].
-        step: goes to a sample, given by its index; this alone is timed.
-        progress: called with the share done, 0 to 1.
-
-    Source: reference set, "How a prediction is scored". Deviation: none.
-    """
-    count, steps, times = len(reference.times), [], []
-    for k in range(1, count):
-        began = time.perf_counter()
-        steps.append(step(k))
-        times.append(time.perf_counter() - began)
-        if k % 50 == 0:
-            progress(k / count)
-    vertices = np.array([initial, *(figures.vertices for figures in steps)])
-    # The needle's own way is given, so only the thread's nodes can be blamed.
-    nodes = vertices[1:, 1:].reshape(-1, 2)
-    gaps = [float(np.hypot(*(nodes - disc.centre).T).min()) - disc.radius - 0.5 * diameter for disc in reference.discs]
-    truth = np.stack([resampled(curve, len(initial) - 1) for curve in reference.threads])
-    error = node_errors(vertices, truth[:, 1:], length).mean(axis=1)
-    median, p99 = np.percentile(times, (50, 99)).tolist()
-    score = CaseScore(
-        name=reference.name,
-        mean_error_percent=float(error.mean()),
-        max_error_percent=float(error.max()),
-        max_stretch=max(figures.strain for figures in steps),
-        max_penetration_m=max(0.0, -min(gaps, default=0.0)),
-        step_median_s=median,
-        step_p99_s=p99,
-        max_residual=max(figures.residual for figures in steps),
-        fallbacks=sum(figures.fallbacks for figures in steps),
-    )
-    return CaseResult(reference, vertices, score)
-
-
-def score_rig(
-    paths: Sequence[Path],
-    segments: int | None = None,
-    progress: Progress = lambda share: None,
-    keep: Callable[[CaseResult], None] = lambda result: None,
-) -> Evaluation:
+def score_rig(paths: Sequence[Path], *, segments: int | None = None, progress: Progress) -> Evaluation:
     """Move the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
 
     Of the scores, `max_residual` is in units of the drag across the whole thread at the case's greatest speed, and
@@ -346,7 +278,6 @@ def score_rig(
         paths: the trajectories.
         segments: n, 100 unless given.
         progress: called with the share done, 0 to 1.
-        keep: called with each case's result.
 
     Raises:
         BagError: a file is no reference trajectory.
@@ -356,7 +287,7 @@ def score_rig(
     # Of a needle whose motion is given, the body does not matter.
     body = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
 
-    def score_case(trajectory: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
+    def begin(trajectory: ReferenceTrajectory, path: Path) -> Simulation:
         thread = _rig_thread(trajectory, path, count)
         first, length = trajectory.threads[0], thread.length
         if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - trajectory.tails[0]) > 0.1 * length / count:
@@ -368,15 +299,61 @@ def score_rig(
         speed = np.linalg.norm(np.diff(trajectory.tails, axis=0), axis=1) / np.diff(trajectory.times)
         force = thread.drag_across * length * max(float(speed.max()), 1e-6)
 
-        def step(index: int) -> StepFigures:
+        def step(index: int) -> tuple[Points, float, float, int]:
             interval = trajectory.times[index] - trajectory.times[index - 1]
             rig.drive(trajectory.tails[index], float(trajectory.headings[index]), interval)
             strain = max(0.0, float(rig.tension.max()) / thread.stretching_stiffness)
-            return StepFigures(rig.thread, strain, rig.residual / force, rig.halvings)
+            return rig.thread, strain, rig.residual / force, rig.halvings
 
-        return run_case(trajectory, rig.thread, length, thread.diameter, step, share)
+        return Simulation(rig.thread, length, thread.diameter, step)
 
-    return Evaluation("rig", "newton", _score_each(paths, score_case, progress, keep))
+    return Evaluation("rig", "newton", _run_cases(paths, begin, progress))
+
+
+def _run_cases(
+    paths: Sequence[Path], begin: Callable[[ReferenceTrajectory, Path], Simulation], progress: Progress
+) -> tuple[CaseResult, ...]:
+    """Step a thread along each trajectory, and score it.
+
+    Args:
+        paths: the trajectories.
+        begin: returns the thread of one.
+        progress: called with the share of all that is done, 0 to 1.
+
+    Source: reference set, "How a prediction is scored". Deviation: none.
+    """
+    results = []
+    for done, path in enumerate(paths):
+        reference = read_reference(path)
+        thread, count = begin(reference, path), len(reference.times)
+        steps, times = [], []
+        for k in range(1, count):
+            began = time.perf_counter()
+            steps.append(thread.step(k))
+            times.append(time.perf_counter() - began)
+            if k % 50 == 0:
+                progress((done + k / count) / len(paths))
+        moved, strains, residuals, fallbacks = zip(*steps, strict=True)
+        vertices = np.array([thread.initial, *moved])
+        # The needle's own way is given, so only the thread's nodes can be blamed.
+        nodes, radius = vertices[1:, 1:].reshape(-1, 2), 0.5 * thread.diameter
+        gaps = [float(np.hypot(*(nodes - disc.centre).T).min()) - disc.radius - radius for disc in reference.discs]
+        truth = np.stack([resampled(curve, len(thread.initial) - 1) for curve in reference.threads])
+        error = node_errors(vertices, truth[:, 1:], thread.length).mean(axis=1)
+        median, p99 = np.percentile(times, (50, 99)).tolist()
+        score = CaseScore(
+            name=reference.name,
+            mean_error_percent=float(error.mean()),
+            max_error_percent=float(error.max()),
+            max_stretch=max(strains),
+            max_penetration_m=max(0.0, -min(gaps, default=0.0)),
+            step_median_s=median,
+            step_p99_s=p99,
+            max_residual=max(residuals),
+            fallbacks=sum(fallbacks),
+        )
+        results.append(CaseResult(reference, vertices, score))
+    return tuple(results)
 
 
 def _rig_thread(trajectory: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:

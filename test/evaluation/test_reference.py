@@ -11,7 +11,6 @@ import pytest
 
 from magnetosuture_thread.evaluation.plots import draw_metrics
 from magnetosuture_thread.evaluation.reference import (
-    CaseResult,
     Evaluation,
     find_references,
     read_reference,
@@ -48,11 +47,13 @@ def write(folder: Path, name: str, offset: float = 0.0, arrays: dict[str, Any] |
     return path
 
 
-def scored(paths: list[Path], formulation: str = "rod", solver: str = "banded") -> tuple[Evaluation, list[CaseResult]]:
-    """Return the scores and the results."""
-    results: list[CaseResult] = []
-    found = score(paths, formulation=formulation, solver=solver, progress=lambda share: None, keep=results.append)
-    return found, results
+def no_progress(share: float) -> None:
+    """Show nothing."""
+
+
+def scored(paths: list[Path], formulation: str = "rod", solver: str = "banded") -> Evaluation:
+    """Return the results."""
+    return score(paths, formulation=formulation, solver=solver, progress=no_progress)
 
 
 def test_a_trajectory_is_read_and_interpolated(tmp_path: Path):
@@ -67,7 +68,7 @@ def test_a_trajectory_is_read_and_interpolated(tmp_path: Path):
 
 
 def test_the_references_that_ship_give_the_error_that_the_readme_states():
-    found, _ = scored(find_references(Path(__file__).parents[2] / "examples" / "reference"))
+    found = scored(find_references(Path(__file__).parents[2] / "examples" / "reference"))
     assert len(found.cases) == 12
     assert round(found.mean_error_percent, 3) == 0.013
     assert round(found.worst_error_percent, 3) == 0.032
@@ -105,14 +106,14 @@ def test_a_missing_file_is_refused(tmp_path: Path):
 @pytest.mark.parametrize("solver", ["banded", "osqp"])
 def test_errors_are_in_percent_of_the_length_and_over_all_samples(tmp_path: Path, solver: str):
     paths = [write(tmp_path, "straight"), write(tmp_path, "off", offset=1.9e-4)]
-    found, results = scored(paths, solver=solver)
+    found = scored(paths, solver=solver)
     straight, off = found.cases
     assert straight.mean_error_percent < 1e-3  # it follows its needle
     assert straight.max_stretch < 1e-4
     assert straight.max_residual < 1e-6
     assert (straight.max_penetration_m, straight.fallbacks) == (0.0, 0)
     assert 0.0 < straight.step_median_s <= straight.step_p99_s
-    assert results[0].vertices.shape == (40, 26, 2)
+    assert found.results[0].vertices.shape == (40, 26, 2)
     assert off.max_error_percent == pytest.approx(1.0, rel=1e-4)
     assert off.mean_error_percent == pytest.approx(39.0 / 40.0, rel=1e-4)  # the first is right
     assert found.worst_error_percent == off.mean_error_percent
@@ -120,7 +121,7 @@ def test_errors_are_in_percent_of_the_length_and_over_all_samples(tmp_path: Path
     mapping = found.to_mapping()
     assert json.loads(json.dumps(mapping)) == mapping
     assert set(mapping) == {"formulation", "solver", "cases", "mean_error_percent", "worst_error_percent"}
-    metrics = results[1].metrics
+    metrics = found.results[1].metrics
     assert metrics.worst is not None
     assert metrics.worst.error == pytest.approx(1.0, rel=1e-4)
     assert draw_metrics(metrics, "off", 0.05).startswith(b"\x89PNG")
@@ -129,7 +130,7 @@ def test_errors_are_in_percent_of_the_length_and_over_all_samples(tmp_path: Path
 def test_the_depth_in_an_obstacle_is_seen(tmp_path: Path):
     """The needle pulls nodes around a disc that they start inside of, so the first samples are too deep."""
     obstacle = {"type": "disc", "cx": -0.0105, "cy": 0.0, "R": 3e-4}
-    found, _ = scored([write(tmp_path, "inside", obstacle=obstacle)], formulation="paper")
+    found = scored([write(tmp_path, "inside", obstacle=obstacle)], formulation="paper")
     assert found.cases[0].max_penetration_m > 1e-5
 
 
@@ -149,8 +150,8 @@ def test_a_file_without_a_thread_is_refused(tmp_path: Path, changes: dict[str, A
 
 
 def test_the_rigs_thread_follows_one_that_is_pulled(tmp_path: Path):
-    kept, told, paths = list[str](), list[float](), [write(tmp_path, "pulled")]
-    evaluation = score_rig(paths, 19, told.append, lambda course: kept.append(course.reference.name))
+    evaluation = score_rig([write(tmp_path, "pulled")], segments=19, progress=no_progress)
+    kept = [result.reference.name for result in evaluation.results]
     case = evaluation.cases[0]
     assert (evaluation.formulation, case.name, kept, case.fallbacks) == ("rig", "pulled", ["pulled"], 0)
     assert case.max_error_percent < 1e-3
@@ -162,4 +163,4 @@ def test_the_rigs_thread_follows_one_that_is_pulled(tmp_path: Path):
 @pytest.mark.parametrize("changes", [{"boundary": "loose"}, {"material": {}}, {"material": {**MATERIAL, "EA_N": 0.0}}])
 def test_metadata_without_a_thread_of_the_rig_are_refused(tmp_path: Path, changes: dict[str, Any]):
     with pytest.raises(BagError, match=r"bad\.npz: has"):
-        score_rig([write(tmp_path, "bad", **changes)])
+        score_rig([write(tmp_path, "bad", **changes)], progress=no_progress)
