@@ -20,12 +20,12 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib import import_module
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
@@ -33,24 +33,23 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, DataEnd, Metadata, Schema, Statistics
 from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from magnetosuture_thread.bags import storage
 from magnetosuture_thread.bags.storage import Budget, Connection, CorruptRegion, DamageReport, MessageDefinition
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
 
-MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 _RECORD = struct.Struct("<BQ")  # opcode and length of the content
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
 _MIN_PRIVATE_OPCODE = 0x80
-_MAX_DEFINITION_BYTES = _WINDOW_BYTES = 1 << 22  # of a record that is no message or chunk; searched or read at a time
+_PIECE_BYTES = 1 << 22  # searched or read at a time; and the most of a record that is no message or chunk
 # A chunk: opcode, length of less than a terabyte, times, size and checksum, a known compression; or the data's end.
 _CHUNK_OR_END = re.compile(
     rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
     rb"|\x0f\x04\0{7}.{4}[\x02-\x04\x08\x0a\x0b\x0d].{5}\0{3}",
     re.DOTALL,
 )
-_lz4: Any = import_module("lz4.frame")  # which has no types
 
 
 class CorruptError(Exception):
@@ -83,7 +82,7 @@ def split_records(
         elif opcode == Opcode.ATTACHMENT or opcode >= _MIN_PRIVATE_OPCODE:
             is_valid = True
         else:
-            most = storage.MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _MAX_DEFINITION_BYTES
+            most = storage.MAX_RECORD_BYTES if opcode == Opcode.CHUNK else _PIECE_BYTES
             is_valid = Opcode.HEADER <= opcode <= Opcode.DATA_END and length <= most
         if not is_valid:
             raise CorruptError("no record where one is expected")
@@ -133,7 +132,7 @@ def unpack_chunk(record: bytes, budget: Budget | None = None) -> tuple[bytes, bo
         if chunk.compression == "zstd" and zstandard.frame_content_size(data) in (-1, size):  # -1: not known
             data = storage.unpack_zstd(data, size)
         elif chunk.compression == "lz4":
-            data = _lz4.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif chunk.compression:
             raise CorruptError("a chunk of a wrong size or an unknown compression")
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError):
@@ -232,17 +231,14 @@ class McapFile:
         self._statistics: Statistics | None = None
         self._data_end = self._data_crc = 0  # where the data section ends, 0 where that is not known; its checksum
         self._is_verified = self._is_trusted = False  # the data by its checksum; the summary by its own
-        try:
-            with storage.open_file(path) as stream:
-                size = stream.seek(0, 2)
-                head = read_range(stream, 0, HEAD_BYTES)
-                if not size:
-                    raise BagError(path, "is empty, expected an mcap file")
-                is_indexed = is_url(path) and self._read_index(stream, size)
-                if not is_indexed:
-                    self._scan(stream, size, progress)
-        except OSError as error:
-            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
+        with storage.refusing_unreadable(path), storage.open_file(path) as stream:
+            size = stream.seek(0, 2)
+            head = read_range(stream, 0, HEAD_BYTES)
+            if not size:
+                raise BagError(path, "is empty, expected an mcap file")
+            is_indexed = is_url(path) and self._read_index(stream, size)
+            if not is_indexed:
+                self._scan(stream, size, progress)
         if not (head.startswith(MAGIC) or self._blocks or self._is_trusted):
             raise BagError(path, substitute_problem(head) or "is no mcap file")
         if not is_indexed:
@@ -273,15 +269,12 @@ class McapFile:
             BagError: the file has changed since it was scanned, or cannot be read any more.
         """
         wanted = frozenset(connections) & set(self.counts)
-        try:
-            with storage.open_file(self.path) as stream:
-                yield from storage.merge_by_time(
-                    (block.start, self._read_block(stream, block, wanted, start, end))
-                    for block in self._blocks
-                    if block.start <= end and block.end >= start and not wanted.isdisjoint(block.counts)
-                )
-        except OSError as error:
-            raise BagError(self.path, f"cannot be read: {error.strerror or error}") from error
+        with storage.refusing_unreadable(self.path), storage.open_file(self.path) as stream:
+            yield from storage.merge_by_time(
+                (block.start, self._read_block(stream, block, wanted, start, end))
+                for block in self._blocks
+                if block.start <= end and block.end >= start and not wanted.isdisjoint(block.counts)
+            )
 
     def _read_block(
         self, stream: BinaryIO, block: Block, wanted: frozenset[int], start: int, end: int
@@ -312,7 +305,7 @@ class McapFile:
             if summary is None or summary.statistics is None:
                 return False
             metadata = [
-                parse_record(read_range(stream, entry.offset, entry.offset + min(entry.length, _MAX_DEFINITION_BYTES)))
+                parse_record(read_range(stream, entry.offset, entry.offset + min(entry.length, _PIECE_BYTES)))
                 for entry in summary.metadata_indexes
             ]
             footer = parse_record(read_range(stream, size - _RECORD.size - 20 - len(MAGIC), size))
@@ -440,7 +433,7 @@ class McapFile:
             corrupt: where none begins.
         """
         while position < size:
-            window = read_range(stream, position, position + _WINDOW_BYTES)
+            window = read_range(stream, position, position + _PIECE_BYTES)
             self._budget.spend("unpacked bytes", len(window))
             for match in _CHUNK_OR_END.finditer(window):
                 at = position + match.start()
@@ -528,7 +521,7 @@ def _crc(stream: BinaryIO, start: int, end: int) -> int:
     """Return the checksum of a part of a file."""
     crc = 0
     stream.seek(start)
-    while data := stream.read(min(_WINDOW_BYTES, max(0, end - stream.tell()))):
+    while data := stream.read(min(_PIECE_BYTES, max(0, end - stream.tell()))):
         crc = zlib.crc32(data, crc)
     return crc
 

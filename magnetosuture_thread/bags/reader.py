@@ -52,12 +52,8 @@ class SqliteFile:
         self.others: Counter[str] = Counter()
         self.counts: dict[int, int] = {}
         self.damage: DamageReport | None = None
-        try:
-            size = path.stat().st_size
-            with path.open("rb") as stream:
-                head = stream.read(HEAD_BYTES)
-        except OSError as error:
-            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
+        with storage.refusing_unreadable(path), path.open("rb") as stream:
+            size, head = path.stat().st_size, stream.read(HEAD_BYTES)
         if not head.startswith(b"SQLite format 3\0"):
             problem = substitute_problem(head) or "is no sqlite3 file"
             raise BagError(path, problem if head else "is empty, expected a sqlite3 file")
@@ -164,14 +160,6 @@ BagFile = McapFile | SqliteFile
 DecoderOf = Callable[[MessageDefinition], MessageDecoder]
 
 
-def _decoders(budget: Budget) -> DecoderOf:
-    """Return what gives the decoder of a definition, which is parsed once.
-
-    Bags do not share it: whether a definition is still parsed depends on those before it.
-    """
-    return cache(partial(MessageDecoder, budget=budget))
-
-
 @dataclass(slots=True)  # not frozen, which would make creating one four times as slow
 class RecordedMessage:
     """A recorded message; not to be changed.
@@ -190,7 +178,9 @@ class RecordedMessage:
     time: int
     data: bytes
     definition: MessageDefinition | None = field(default=None, repr=False, compare=False)
-    decoder_of: DecoderOf = field(default=_decoders(Budget("messages", 0)), repr=False, compare=False)
+    decoder_of: DecoderOf = field(
+        default=cache(partial(MessageDecoder, budget=Budget("messages", 0))), repr=False, compare=False
+    )
 
     @property
     def decoder(self) -> MessageDecoder:
@@ -246,7 +236,8 @@ class Bag:
         self.path = path
         files = storage.find_bag_files(path)
         budget = Budget(path, sum(_file_size(file) for file in files.files))
-        self._decoder_of = _decoders(budget)
+        # Parses a definition once. Bags do not share it: whether one is still parsed depends on those before it.
+        self._decoder_of = cache(partial(MessageDecoder, budget=budget))
         self._files, problems = _open(files.files, budget, progress)
         lost = [DamageReport((region,), 0, region.end, None) for region in (*files.lost, *problems)]
         self.damage = storage.merge_reports([*(file.damage for file in self._files), *lost])
@@ -254,7 +245,7 @@ class Bag:
         self.facts = [{"file": file.path.name, **file.facts} for file in self._files]
         self.others = sum((file.others for file in self._files), Counter[str]())
         self.notes = next((file.notes for file in self._files if file.notes), files.notes)
-        self.salvaged_without_checksum = self.notes.get(storage.SALVAGED_NOTE, "")
+        self.salvaged_without_checksum = self.notes.get("unverified", "")
         doubt = next((file.has_no_checksum for file in self._files if file.has_no_checksum), "")
         self.has_no_checksum = doubt or self.notes.get(storage.NO_CHECKSUM_NOTE, "")
         filled = [file for file in self._files if file.counts]

@@ -163,10 +163,14 @@ class Recording:
             UnfitError: that is impossible.
             BagError: its frame is never connected to the dish frame.
         """
+        data = self._converted_data(record, channel)
+        return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
+
+    def _converted_data(self, record: RecordedMessage, channel: Channel) -> bytes:
         is_converted = channel.type_name in CONVERTED
         is_ours = record.type_name == channel.type_name and record.decoder.is_ours
         if is_ours and (not is_converted or (self._dish_frame == DISH_FRAME and is_in_dish_frame(record.data))):
-            return RecordedMessage(channel.recorded, channel.type_name, record.time, self._in_our_frame(record))
+            return self._in_our_frame(record)
         if not is_converted:
             raise UnfitError(f"its type {record.type_name} has another definition than ours")
         frame, stamp = self._dish_frame, record.time  # of a Twist, which has none
@@ -178,17 +182,14 @@ class Recording:
             raise UnfitError(error.problem) from None
         frame = frame.lstrip("/")
         if is_ours and record.type_name == TWIST and frame == self._needle_frame:
-            message.header.frame_id = interface.NEEDLE_FRAME
-            data = bytes(typestore().serialize_cdr(message, record.type_name))
-            return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
+            return _in_frame(message, interface.NEEDLE_FRAME)
         matrix = None if frame == self._dish_frame else self._transform_to_dish(record.topic, frame, stamp)
         try:
-            data = converted(message, channel.type_name, stamp, matrix)
+            return converted(message, channel.type_name, stamp, matrix)
         except (AttributeError, TypeError, ValueError) as error:  # of another definition of the type
             raise UnfitError(str(error)) from None
         except struct.error:
             raise UnfitError("a value out of range of our type") from None
-        return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
 
     def _in_our_frame(self, record: RecordedMessage) -> bytes:
         """Return the bytes of a message of ours, where it is in the bag's dish frame in ours."""
@@ -196,9 +197,7 @@ class Recording:
             return record.data
         with suppress(BagError):  # it has no frame, or cannot be decoded, which whoever takes it reports
             if stamp_and_frame(record.topic, record.data)[1].lstrip("/") == self._dish_frame:
-                message = record.decode()
-                message.header.frame_id = DISH_FRAME
-                return bytes(typestore().serialize_cdr(message, record.type_name))
+                return _in_frame(record.decode(), DISH_FRAME)
         return record.data
 
     def _transform_to_dish(self, topic: str, frame: str, stamp: int) -> Matrix:
@@ -230,6 +229,12 @@ class Recording:
                 yield record.topic, record.decode()
             except BagError as error:
                 self.refused[str(error)] += 1
+
+
+def _in_frame(message: Any, frame: str) -> bytes:
+    """Return a message with a header as CDR bytes, in a frame of another name."""
+    message.header.frame_id = frame
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 class UnfitError(Exception):

@@ -7,6 +7,7 @@ import math
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from heapq import heappop, heappush, heapreplace
 from itertools import chain
@@ -28,7 +29,6 @@ UNPACKERS = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".bz2": "bu
 COMPRESSED_SUFFIXES = tuple(f"{suffix}{packed}" for suffix in STORAGE_SUFFIXES for packed in UNPACKERS)
 QOS, TYPE_HASH = "offered_qos_profiles", "topic_type_hash"  # metadata of a connection, in mcap and in sqlite3
 NOTES = "magnetosuture"  # name of the mcap record that holds our notes, and prefix of our entries in metadata.yaml
-SALVAGED_NOTE = "unverified"  # note of a bag that an earlier version salvaged without checksums: why it may be wrong
 NO_CHECKSUM_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 MAX_SILENCE = 5.0  # s without any message, which a person waits for; longer is a pause, or a clock that was set
 MAX_RECORD_BYTES = 1 << 26  # of a message or a chunk of messages, packed or not
@@ -241,6 +241,15 @@ def unpack_zstd(data: bytes, size: int = MAX_RECORD_BYTES) -> bytes:
     if zstandard.frame_content_size(data) > size:
         raise zstandard.ZstdError(f"it is larger than {size} bytes")
     return zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).decompress(data, max_output_size=size)
+
+
+@contextmanager
+def refusing_unreadable(path: Path) -> Iterator[None]:
+    """Turn what the file system says of a file into a `BagError`."""
+    try:
+        yield
+    except OSError as error:
+        raise BagError(path, f"cannot be read: {error.strerror or error}") from error
 
 
 def open_file(path: Path) -> BinaryIO:

@@ -32,9 +32,6 @@ from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
 if TYPE_CHECKING:
     from magnetosuture_thread.bags.reader import Bag
 
-MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
-MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
-DISK_PERIOD = 0.001  # s, between looks at whether the disk has taken a chunk
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
 
 Message = tuple[int, int, bytes, int, int]  # arguments of `mcap.writer.Writer.add_message`
@@ -171,11 +168,12 @@ class BagWriter:
         self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
         self._bytes += len(data)
         self._first, self._last = min(self._first, time), max(self._last, time)
-        is_full = self._bytes > MAX_CHUNK_BYTES or self._last - self._first > MAX_CHUNK_SPAN
+        # Bytes, uncompressed; or ns from first to last message, which are lost if the recorder is killed.
+        is_full = self._bytes > 256 * 1024 or self._last - self._first > 2_000_000_000
         # Without the definition of its topic a message is lost: it comes in a chunk that is too small to be hit.
         if is_full or number > self._defined:
             while self._handed > self._taken:  # so that at most two chunks wait for the disk
-                sleep(DISK_PERIOD)
+                sleep(0.001)
             if self._problem is not None:
                 self.close()
             self._defined = len(self._connections)

@@ -14,9 +14,9 @@ import pytest
 import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import RecordBuilder
+from mcap.writer import MCAP0_MAGIC as MAGIC
 from mcap.writer import Writer
 
-from magnetosuture_thread.bags.mcap import MAGIC
 from magnetosuture_thread.bags.message_types import MessageDecoder
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import Budget, MessageDefinition
