@@ -50,7 +50,6 @@ DISH, NEEDLE = (
     _COUNT.pack(len(frame.encode()) + 1) + frame.encode() + b"\0"
     for frame in (interface.DISH_FRAME, interface.NEEDLE_FRAME)
 )
-DISH_END = len(BEGIN) + 8 + len(DISH)  # where a header in the dish frame ends, behind its stamp
 LIFETIME = 500_000_000  # ns of a marker that is a text, an arrow or a forecast; poses come far more often
 COLOURS: dict[str, Colour] = {
     "ink": (0.1, 0.13, 0.16),

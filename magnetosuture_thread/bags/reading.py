@@ -315,6 +315,16 @@ def plane_point(message: Any, field: str) -> Vector:
     return _finite((message.point.x, message.point.y), f"{field}.point", "finite numbers [m]")
 
 
+def plane_force(message: Any, field: str) -> Vector:
+    """Return the force of a WrenchStamped in the dish plane, shape (2,) [N].
+
+    Raises:
+        InvalidInputError: wrong frame, or not finite.
+    """
+    require_dish_frame(message.header.frame_id, field)
+    return _finite((message.wrench.force.x, message.wrench.force.y), field, "a finite force")
+
+
 def header_stamp(data: bytes) -> int | None:
     """Return the stamp of CDR bytes that begin with a header [ns]; None if there are too few."""
     if len(data) < 12:
@@ -343,11 +353,6 @@ def stamp_and_frame(topic: str, data: bytes) -> tuple[int, str]:
     raise BagError(topic, "a message has no header that can be read")
 
 
-def is_in_dish_frame(data: bytes) -> bool:
-    """Return whether a message that begins with a header is in the dish frame, and written as our machines write it."""
-    return data[:2] == packing.BEGIN[:2] and data[12 : packing.DISH_END] == packing.DISH
-
-
 def stamp_of(record: RecordedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     stamp = header_stamp(record.data)
@@ -373,28 +378,6 @@ def read_path(record: RecordedMessage) -> Points:
     """
     points = _plain_path(record.data)
     return path_points(record.decode(), record.topic) if points is None else points
-
-
-def read_force(record: RecordedMessage) -> Vector:
-    """Return the force in the dish plane of a recorded wrench, shape (2,) [N].
-
-    Raises:
-        BagError: it cannot be decoded.
-        InvalidInputError: it is of another frame, or not finite.
-    """
-    message = record.decode()
-    require_dish_frame(message.header.frame_id, record.topic)
-    return _finite((message.wrench.force.x, message.wrench.force.y), record.topic, "a finite force")
-
-
-def read_observation(record: RecordedMessage) -> ThreadObservation:
-    """Return a recorded observation of the thread.
-
-    Raises:
-        BagError: it cannot be decoded.
-        InvalidInputError: it is not valid; see `thread_observation`.
-    """
-    return thread_observation(record.decode(), record.topic)
 
 
 def _plain_path(data: bytes) -> Points | None:

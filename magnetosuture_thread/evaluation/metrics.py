@@ -583,7 +583,7 @@ class RunMetrics:
         Over the frames with both; nan where there are none, or where nothing pulls.
         """
         peak, errors = self.maximum("true_pull"), self.series.known("pull_error")
-        return 100.0 * float(np.sqrt(np.mean(errors**2))) / peak if len(errors) and peak > 0.0 else math.nan
+        return 100.0 * frames.rms(errors) / peak if len(errors) and peak > 0.0 else math.nan
 
     def _time(self, stamp: int) -> float:
         return (stamp - self._start) * 1e-9

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.reading import parse_scene_message, stamp_of
+from magnetosuture_thread.bags.reading import parse_scene_message, plane_force, stamp_of, thread_observation
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
@@ -71,8 +71,8 @@ def _read_prediction(record: RecordedMessage) -> Points:
 _PARTS: dict[str, tuple[str, Callable[[RecordedMessage], Any], Any]] = {
     interface.GROUND_TRUTH_THREAD.recorded: ("ground_truth", reading.read_path, np.empty((0, 2))),
     interface.MEASURED_THREAD.recorded: ("measured", reading.read_path, np.empty((0, 2))),
-    interface.THREAD_OBSERVATION.recorded: ("observation", reading.read_observation, ThreadObservation()),
-    interface.GROUND_TRUTH_PULL.recorded: ("true_pull", reading.read_force, np.empty(0)),
+    interface.THREAD_OBSERVATION.recorded: ("observation", lambda r: thread_observation(r.decode(), r.topic), ThreadObservation()),
+    interface.GROUND_TRUTH_PULL.recorded: ("true_pull", lambda r: plane_force(r.decode(), r.topic), np.empty(0)),
     interface.PREDICTED_THREAD.recorded: ("recorded", _read_prediction, np.empty((0, 2))),
 }
 
