@@ -67,12 +67,17 @@ def _read_prediction(record: RecordedMessage) -> Points:
     return vertices if len(vertices) > 1 and np.isfinite(vertices).all() else np.empty((0, 2))
 
 
+def _decoded(read: Callable[[Any, str], Any]) -> Callable[[RecordedMessage], Any]:
+    """Return how a recorded message is read by what reads a message."""
+    return lambda record: read(record.decode(), record.topic)
+
+
 # Part of an observation that each topic gives, how it is read, and what stands for one that is not valid.
 _PARTS: dict[str, tuple[str, Callable[[RecordedMessage], Any], Any]] = {
     interface.GROUND_TRUTH_THREAD.recorded: ("ground_truth", reading.read_path, np.empty((0, 2))),
     interface.MEASURED_THREAD.recorded: ("measured", reading.read_path, np.empty((0, 2))),
-    interface.THREAD_OBSERVATION.recorded: ("observation", lambda r: thread_observation(r.decode(), r.topic), ThreadObservation()),
-    interface.GROUND_TRUTH_PULL.recorded: ("true_pull", lambda r: plane_force(r.decode(), r.topic), np.empty(0)),
+    interface.THREAD_OBSERVATION.recorded: ("observation", _decoded(thread_observation), ThreadObservation()),
+    interface.GROUND_TRUTH_PULL.recorded: ("true_pull", _decoded(plane_force), np.empty(0)),
     interface.PREDICTED_THREAD.recorded: ("recorded", _read_prediction, np.empty((0, 2))),
 }
 
