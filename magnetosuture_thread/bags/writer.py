@@ -258,6 +258,7 @@ class BagWriter:
         """Write the summary and metadata.yaml."""
         if isinstance(self._problem, OSError):
             return
+        metadata = self.folder / storage.METADATA_FILE
         try:
             self._register(len(self._connections))
             information = self._information()
@@ -265,19 +266,15 @@ class BagWriter:
             self._mcap.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
+            self._size = self._stream.tell()
             self._stream.close()
-        except OSError as error:
-            self._fail(error)
-            return
-        metadata = self.folder / storage.METADATA_FILE
-        try:
             with metadata.open("w", encoding="utf-8") as stream:
                 yaml.safe_dump({"rosbag2_bagfile_information": information}, stream, sort_keys=False)
                 stream.flush()
                 os.fsync(stream.fileno())
-        except OSError as error:  # a part of it would be refused, where readers do without it
-            metadata.unlink(missing_ok=True)
-            self._problem = error
+        except OSError as error:
+            self._fail(error)
+            metadata.unlink(missing_ok=True)  # a part of it would be refused, where readers do without it
 
     def _fail(self, problem: OSError) -> None:
         """End the file with the last complete chunk."""
