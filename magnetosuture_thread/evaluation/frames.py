@@ -244,11 +244,10 @@ class ErrorMap:
 
     Args:
         length: of the thread [m].
-        columns: of the map.
     """
 
-    def __init__(self, length: float, columns: int = 300) -> None:
-        self._length, self._limit = length, 2 * columns
+    def __init__(self, length: float) -> None:
+        self._length, self._limit = length, 600  # columns, at which it is full
         self._frames = 1  # of a column
         self._count = 0  # frames in all columns
         self._times: list[float] = []

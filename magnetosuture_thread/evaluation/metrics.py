@@ -52,13 +52,6 @@ def plain_values(figures: Any) -> dict[str, Any]:
     return {key: finite_or_none(value) for key, value in asdict(figures).items()}
 
 
-def error_figures(errors: Array) -> dict[str, float] | None:
-    """Return count, mean, median, p99 and maximum of errors in %; None if there are none."""
-    finite = errors[np.isfinite(errors)]
-    percentiles = Percentiles.of(finite)
-    return {"count": len(finite), "mean": float(finite.mean()), **asdict(percentiles)} if percentiles else None
-
-
 def stage_latencies(
     published: Mapping[str, Mapping[int, float]], arrived: Mapping[str, Mapping[int, float]], applied: Set[int]
 ) -> dict[str, Percentiles | None]:
@@ -552,8 +545,13 @@ class RunMetrics:
         return self._worst.get(self.target)
 
     def errors(self, prefix: str = "error") -> dict[str, dict[str, float] | None]:
-        """Return the figures of the columns `PREFIX_TARGET` by target; see `error_figures`."""
-        return {target: error_figures(self.series.column(f"{prefix}_{target}")) for target in self.targets}
+        """Return count, mean, median, p99 and maximum of the columns `PREFIX_TARGET` in %, by target; or None."""
+        figures: dict[str, dict[str, float] | None] = {}
+        for target in self.targets:
+            known = self.series.known(f"{prefix}_{target}")
+            spread = Percentiles.of(known)
+            figures[target] = {"count": len(known), "mean": float(known.mean()), **asdict(spread)} if spread else None
+        return figures
 
     @property
     def estimation(self) -> EstimationFigures:

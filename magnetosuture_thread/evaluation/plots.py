@@ -39,7 +39,6 @@ AGAINST = {"truth": "ground truth", "seen": "the measured centreline"}
 # Of a shape in a scene: face and edge.
 KIND_COLOURS = dict(tissue=("#f0b9b4", "#b8665f"), instrument=("#b9c6d2", "#56697a"), wall=("#cbbfa9", "#6f624c"))
 MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", GOOD])  # from 0 to 1 mm
-ERROR_COLOURS = LinearSegmentedColormap.from_list("error", ["#f7f4f8", "#c994c7", PREDICTED, "#2b0726"])
 THREADS: tuple[tuple[str, str, float, float, Any], ...] = (
     ("measured", SEEN, 5.0, 0.45, "solid"),
     ("predicted from the needle's poses", PREDICTED, 3.0, 1.0, "solid"),
@@ -202,7 +201,8 @@ def _draw_along(axes: Axes, bar: Axes, metrics: RunMetrics) -> None:
         bar.set_axis_off()
         return
     times, lengths, values = grid
-    mesh = axes.pcolormesh(times, 1e3 * lengths, values, cmap=ERROR_COLOURS, vmin=0.0, shading="nearest")
+    colours = LinearSegmentedColormap.from_list("error", ["#f7f4f8", "#c994c7", PREDICTED, "#2b0726"])
+    mesh = axes.pcolormesh(times, 1e3 * lengths, values, cmap=colours, vmin=0.0, shading="nearest")
     scale = axes.figure.colorbar(mesh, cax=bar)
     scale.ax.tick_params(labelsize=8, colors=INK, length=2, pad=1)
 

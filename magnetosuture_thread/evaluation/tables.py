@@ -47,8 +47,6 @@ Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")  # of a recorded graph
 TEXTS = ("bag", "path", "setup", "simulated", "source", "formulation", "damage", "unverified", "problem")
-TIMES = ("step_median_s", "step_p99_s", "tracker_median_s", "tracker_p99_s")  # differ from run to run
-ENDINGS = (".json", ".csv", ".parquet")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,8 +350,8 @@ def check_table(path: Path) -> None:
     Raises:
         ConfigurationError: the ending is not known, or it is of Parquet and pyarrow cannot be imported.
     """
-    if path.suffix not in ENDINGS:
-        raise ConfigurationError("--table", str(path), f"a name that ends in {', '.join(ENDINGS)}")
+    if path.suffix not in (".json", ".csv", ".parquet"):
+        raise ConfigurationError("--table", str(path), "a name that ends in .json, .csv, .parquet")
     if path.suffix == ".parquet":
         try:
             from pyarrow import parquet  # noqa: F401

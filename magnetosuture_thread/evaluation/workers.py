@@ -28,9 +28,6 @@ Results = Iterator[tuple[int, Any]]  # index of a task, and what came of it
 # A worker is one of as many as there are processors for: what it uses must not start a thread for each of them.
 ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")] + ["OPENCV_FOR_THREADS_NUM"]
 CONNECT_TIMEOUT = 20.0  # s to reach a scheduler
-STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
-# A result has the same bits only where these are the same. OpenCV comes by pip or as Ubuntu's package.
-SOFTWARE = ("magnetosuture_thread", "numpy", "scipy", "numba", "opencv-python-headless", "osqp")
 _ONE_AT_A_TIME = threading.Lock()  # in a worker of several threads: matplotlib is not made for them
 _WORK: list[Work] = []  # of a process, which gets it when it starts
 
@@ -90,8 +87,8 @@ class TaskRunner:
             progress: called with the share of all tasks done, 0 to 1.
 
         Raises:
-            ConfigurationError: the scheduler is gone, or a worker has other software than this process (`SOFTWARE`, or
-                another minor version of Python), so that its results may differ.
+            ConfigurationError: the scheduler is gone, or a worker has other software than this process (`_software`),
+                so that its results may differ.
         """
         done, lost = 0, list[int]()
 
@@ -184,9 +181,12 @@ class TaskRunner:
 
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
-    """Block `STOPS` and set `ONE_THREAD`; a process keeps both as they are when it starts."""
+    """Block signals that are meant for the parent, which ends its workers itself, and set `ONE_THREAD`.
+
+    A process keeps both as they are when it starts.
+    """
     before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
@@ -232,9 +232,13 @@ def _run_task(work: Work | None, software: Mapping[str, str], task: Any) -> tupl
 
 @cache
 def _software() -> dict[str, str]:
-    """Return the versions of a process's software, looked up once: what is imported stays."""
+    """Return the versions of a process's software, looked up once: what is imported stays.
+
+    A result has the same bits only where these are the same.
+    """
     versions = {"Python": ".".join(platform.python_version_tuple()[:2])}
-    for name in SOFTWARE:
+    # OpenCV comes by pip or as Ubuntu's package.
+    for name in ("magnetosuture_thread", "numpy", "scipy", "numba", "opencv-python-headless", "osqp"):
         try:
             versions[name] = version(name)
         except PackageNotFoundError:

@@ -18,7 +18,6 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import RANGE_BYTES, open_file
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
-from magnetosuture_thread.evaluation.tables import TIMES
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import parse_location
 from test.bags.bags import (
@@ -34,6 +33,7 @@ from test.bags.bags import (
     write_many_chunks,
     write_mcap,
 )
+from test.evaluation.runs import TIMES
 
 PICTURE_BYTES = 300_000
 

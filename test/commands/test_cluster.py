@@ -18,9 +18,9 @@ import pytest
 from magnetosuture_thread import cli
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.evaluation import workers
-from magnetosuture_thread.evaluation.tables import TIMES
 from magnetosuture_thread.evaluation.workers import TaskRunner, Work, WorkerDiedError
 from magnetosuture_thread.settings.errors import ConfigurationError
+from test.evaluation.runs import TIMES
 
 pytestmark = pytest.mark.slow
 

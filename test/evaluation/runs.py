@@ -14,6 +14,9 @@ LENGTH = 0.019
 NODES = np.column_stack([0.004 - LENGTH * np.arange(26) / 25, np.zeros(26)])
 EVIL = '<script>alert("x")</script>\'"&'
 
+# Columns of an evaluated bag's row that differ from run to run.
+TIMES = ("step_median_s", "step_p99_s", "tracker_median_s", "tracker_p99_s")
+
 
 def margins(clearance: float) -> Margins:
     """Return margins of node 7 at obstacle 0."""
