@@ -41,6 +41,7 @@ Colour = tuple[float, ...]
 Place = Sequence[float] | Vector
 
 Stamp = Any  # nanoseconds as int, or a time message of any library
+Fields = tuple[tuple[str, Any, int], ...]  # of each what it is, its format, type or fields, and its size [bytes]
 
 IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
 SELF_CONTACT = {None: 0, True: 1, False: 2}  # as in Scene.msg
@@ -72,11 +73,17 @@ def pack(layout: str, *values: Any) -> bytes:
             spaces. `header` is a stamp in the dish frame, `needle_header` one in the needle's, and `time` a stamp, all
             of type `Stamp`; `text` is a string; numbers have their names in ROS. `float64[]` is a sequence of numbers,
             `float64[9]` an array, whose numbers stand without a count; `points` is an array of shape (m, 2) as a
-            sequence of points or vectors with z = 0; `texts` is a sequence of strings.
+            sequence of points or vectors with z = 0; `texts` is a sequence of strings; `{ ... }` is a sequence of
+            messages with the fields between the braces, each message a tuple of their values.
         values: of the fields.
     """
     data = bytearray(BEGIN)
-    for (kind, number, size), value in zip(_fields(layout), values, strict=True):
+    _put_fields(data, _fields(layout), values)
+    return bytes(data)
+
+
+def _put_fields(data: bytearray, fields: Fields, values: Sequence[Any]) -> None:
+    for (kind, number, size), value in zip(fields, values, strict=True):
         if kind == "number":
             data += bytes((4 - len(data)) % size)
             data += number.pack(value)
@@ -86,26 +93,34 @@ def pack(layout: str, *values: Any) -> bytes:
             data += {"header": DISH, "needle_header": NEEDLE, "time": b""}[kind]
         elif kind == "text":
             _put_text(data, value)
-        elif kind == "texts":
+        elif kind in ("texts", "messages"):
             data += bytes(-len(data) % 4) + _COUNT.pack(len(value))
-            for text in value:
-                _put_text(data, text)
+            for part in value:
+                if kind == "texts":
+                    _put_text(data, part)
+                else:
+                    _put_fields(data, number, part)
         else:
             _put_numbers(data, kind, number, value)
-    return bytes(data)
 
 
 @cache
-def _fields(layout: str) -> tuple[tuple[str, Any, int], ...]:
-    """Return for each field what it is, its format or type, and its size [bytes]."""
-    fields: list[tuple[str, Any, int]] = []
+def _fields(layout: str) -> Fields:
+    """Return the fields of a layout."""
+    levels: list[list[tuple[str, Any, int]]] = [[]]
     formats = {"bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
     for word in layout.split():
-        name, bracket, count = word.partition("[")
-        number = struct.Struct("<" + formats.get(name, "d"))
-        kind = name if name not in formats else "sequence" if count == "]" else "array" if bracket else "number"
-        fields.append((kind, number if kind == "number" else np.dtype(number.format), number.size))
-    return tuple(fields)
+        if word == "{":
+            levels.append([])
+        elif word == "}":
+            inner = tuple(levels.pop())
+            levels[-1].append(("messages", inner, 4))
+        else:
+            name, bracket, count = word.partition("[")
+            number = struct.Struct("<" + formats.get(name, "d"))
+            kind = name if name not in formats else "sequence" if count == "]" else "array" if bracket else "number"
+            levels[-1].append((kind, number if kind == "number" else np.dtype(number.format), number.size))
+    return tuple(levels[0])
 
 
 def _put_text(data: bytearray, text: str) -> None:
@@ -227,20 +242,17 @@ def packed_scene(stamp: Stamp, scene: Scene) -> bytes:
 
     A shape has a sequence of none or one disc, and one of none or one polygon.
     """
-    layout, dish = "header text float64 float64 float64 uint8 uint32", scene.dish
-    values: list[Any] = [stamp, scene.version, dish.diameter, dish.depth, dish.wall_friction]
-    values += [SELF_CONTACT[dish.self_contact], len(scene.shapes)]
+    dish, shapes = scene.dish, []
     for shape in scene.shapes:
-        geometry = shape.geometry
-        values += [shape.name, shape.kind]
+        geometry, discs, polygons = shape.geometry, list[Any](), list[Any]()
         if isinstance(geometry, Disc):
-            layout += " text text uint32 float64[3] uint32 float64"
-            values += [1, (*geometry.centre, geometry.radius), 0]
+            discs = [((*geometry.centre, geometry.radius),)]
         else:
-            layout += " text text uint32 uint32 points uint32" + " points" * len(geometry.holes) + " float64"
-            values += [0, 1, geometry.outline, len(geometry.holes), *geometry.holes]
-        values.append(shape.friction)
-    return pack(layout, *values)
+            polygons = [(geometry.outline, [(hole,) for hole in geometry.holes])]
+        shapes.append((shape.name, shape.kind, discs, polygons, shape.friction))
+    layout = "header text float64 float64 float64 uint8 { text text { float64[3] } { points { points } } float64 }"
+    measures = (dish.diameter, dish.depth, dish.wall_friction, SELF_CONTACT[dish.self_contact])
+    return pack(layout, stamp, scene.version, *measures, shapes)
 
 
 def packed_tracker_state(stamp: Stamp, track: Track, processing_time: float = 0.0) -> bytes:
@@ -263,14 +275,12 @@ def packed_tracker_state(stamp: Stamp, track: Track, processing_time: float = 0.
 
 def packed_observation(stamp: Stamp, observation: ThreadObservation) -> bytes:
     """Return what a frame shows of the thread as a ThreadObservation."""
-    layout, values = ["header uint32"], [stamp, len(observation.pieces)]
-    for piece in observation.pieces:
-        layout.append("points float64[] uint8 uint8 float64 float64 bool float64")
-        values += [piece.points, piece.deviation, piece.first_end, piece.last_end]
-        values += [*piece.arc_length, bool(piece.direction_known), piece.confidence]
-    layout += ["bool uint32", *["points"] * len(observation.hidden)]
-    values += [bool(observation.complete), len(observation.hidden), *observation.hidden]
-    return pack(" ".join(layout), *values)
+    pieces = [
+        (p.points, p.deviation, p.first_end, p.last_end, *p.arc_length, bool(p.direction_known), p.confidence)
+        for p in observation.pieces
+    ]
+    layout = "header { points float64[] uint8 uint8 float64 float64 bool float64 } bool { points }"
+    return pack(layout, stamp, pieces, bool(observation.complete), [(outline,) for outline in observation.hidden])
 
 
 def packed_prediction(stamp: Stamp, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
@@ -310,16 +320,16 @@ def packed_estimate(stamp: Stamp, estimate: ThreadEstimate) -> bytes:
         estimate: of the thread at the same time.
     """
     square, degrees = (0.0, 0) if estimate.innovations is None else estimate.innovations.total
-    disturbances: list[Any] = []
+    disturbances = []
     for force in estimate.disturbances:
         numbers = (force.arc_length, force.extent, *force.position, 0.0, *force.direction, 0.0)
-        disturbances += [(*numbers, force.force, force.significance), round(force.since * 1e9)]
-    layout = "header text points float64[] float64[] bool float64 float64 uint32 float64 uint32 uint32 "
+        disturbances.append(((*numbers, force.force, force.significance), round(force.since * 1e9)))
     return pack(
-        layout + "float64[10] time " * len(estimate.disturbances) + "texts bool float64",
+        "header text points float64[] float64[] bool float64 float64 uint32 float64 uint32 { float64[10] time } "
+        "texts bool float64",
         *(stamp, estimate.prediction.scene_version, estimate.positions, estimate.deviation),
         *(np.ravel(estimate.covariance), not estimate.corrected, estimate.unmeasured_for, estimate.hidden),
-        *(estimate.points, square, degrees, len(estimate.disturbances), *disturbances),
+        *(estimate.points, square, degrees, disturbances),
         *(estimate.problems[:8], estimate.converged, estimate.residual),
     )
 
@@ -341,17 +351,14 @@ def packed_margins(
     columns: list[ArrayLike] = [np.repeat(np.arange(len(barriers)), [len(barrier) for barrier in barriers])]
     for name in ("node", "obstacle", "value", "clearance", "bound"):
         columns.append(np.concatenate([getattr(barrier, name) for barrier in barriers]) if barriers else ())
-    rows: list[Any] = []
-    for row in known.minima:
-        rows += [row.barrier, row.node[0], row.obstacle[0], row.value[0], row.clearance[0], row.bound[0]]
+    rows = [(m.barrier, m.node[0], m.obstacle[0], m.value[0], m.clearance[0], m.bound[0]) for m in known.minima]
     # As in SafetyMargins.msg.
     source, contact = (0, 0) if margins is None else (1 + of_estimate, 2 if margins.in_contact else 1)
     return pack(
-        "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] uint32 "
-        + "text uint32 int32 float64 float64 float64 " * len(known.minima)
-        + "uint8 uint32[] uint8 uint32[] float64",
+        "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] "
+        "{ text uint32 int32 float64 float64 float64 } uint8 uint32[] uint8 uint32[] float64",
         *(stamp, known.scene_version, margins is not None, "" if margins is not None else reason, source),
-        *([barrier.barrier for barrier in barriers], *columns, len(known.minima), *rows, contact, known.in_contact),
+        *([barrier.barrier for barrier in barriers], *columns, rows, contact, known.in_contact),
         *(friction.state, friction.nodes, friction.slowdown),
     )
 
@@ -527,22 +534,20 @@ def _text(name: str, number: int, colour: str, place: Place, caption: str, size:
     return Marker(name, number, kind, scale, COLOURS[colour], place=place, caption=caption, lifetime=LIFETIME)
 
 
-# Header to points; then colours, a texture and its coordinates, the text, and a mesh, all empty but the text.
-_MARKER = (
-    "header text int32 int32 int32 float64[7] float64[3] float32[4] int32 uint32 bool points "
-    "uint32 text time text text uint32 uint32 text text text uint32 bool "
-)
-
-
 def packed_markers(stamp: Stamp, markers: Sequence[Marker]) -> bytes:
     """Return a MarkerArray."""
-    values: list[object] = []
+    # Header to points; then colours, a texture and its coordinates, the text, and a mesh, all empty but the text.
+    layout = (
+        "{ header text int32 int32 int32 float64[7] float64[3] float32[4] time bool points "
+        "uint32 text time text text uint32 uint32 text text text uint32 bool }"
+    )
+    messages = []
     for marker in markers:
         pose = (*(*marker.place, 0.0)[:3], 0.0, 0.0, 0.0, 1.0)
-        values += [stamp, marker.namespace, marker.number, marker.kind, marker.action, pose, marker.scale]
-        values += [(*marker.colour, marker.opacity), *divmod(marker.lifetime, 10**9), False, marker.points]
-        values += [0, "", 0, "", "", 0, 0, marker.caption, "", "", 0, False]
-    return pack("uint32 " + _MARKER * len(markers), len(markers), *values)
+        head = (stamp, marker.namespace, marker.number, marker.kind, marker.action, pose, marker.scale)
+        body = ((*marker.colour, marker.opacity), marker.lifetime, False, marker.points)
+        messages.append((*head, *body, 0, "", 0, "", "", 0, 0, marker.caption, "", "", 0, False))
+    return pack(layout, messages)
 
 
 def packed_thread_markers(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import astuple, dataclass, field
 from difflib import get_close_matches
@@ -287,9 +287,8 @@ class Bag:
         for topic in topics or ():
             if topic in self.conflicts:
                 raise BagError(self.path, self.conflict(topic))
-        wanted = set(self.topics if topics is None else topics)
-        loaded = (self._load(item, refused, cdr_only=True) for item in self.stored(wanted, start, duration))
-        return (record for record in loaded if record is not None)
+        stored = self.stored(set(self.topics if topics is None else topics), start, duration)
+        return (record for _, record in self._records(stored, refused, cdr_only=True))
 
     def conflict(self, topic: str) -> str:
         """Return in words that a topic has two types."""
@@ -329,9 +328,7 @@ class Bag:
         Args:
             refused: counts the messages that cannot be decompressed, by reason.
         """
-        for item in self.stored():
-            if record := self._load(item, refused):
-                yield item.connection, record
+        return self._records(self.stored(), refused)
 
     def connections(self) -> list[Connection]:
         """Return the connections of all files, under their recorded names."""
@@ -345,21 +342,22 @@ class Bag:
         """Return the name that a topic was recorded under."""
         return next(recorded for recorded, name in self._names.items() if name == topic)
 
-    def _load(
-        self, item: storage.StoredMessage, refused: Counter[str] | None, cdr_only: bool = False
-    ) -> RecordedMessage | None:
-        """Return a message; None, and count it, if it cannot be decompressed or has another serialization."""
-        kind, topic = item.connection, self._names[item.connection.topic]
-        try:
-            if cdr_only and kind.serialization != CDR:
-                raise BagError(topic, f"its messages are written as {kind.serialization!r}, expected {CDR!r}")
-            data = self.load(item)
-        except BagError as error:
-            if refused is None:
-                raise
-            refused[str(error)] += 1
-            return None
-        return RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self._decoder_of)
+    def _records(
+        self, stored: Iterable[storage.StoredMessage], refused: Counter[str] | None, cdr_only: bool = False
+    ) -> Iterator[tuple[Connection, RecordedMessage]]:
+        """Yield messages; those that cannot be decompressed or have another serialization are counted, or raise."""
+        for item in stored:
+            kind, topic = item.connection, self._names[item.connection.topic]
+            try:
+                if cdr_only and kind.serialization != CDR:
+                    raise BagError(topic, f"its messages are written as {kind.serialization!r}, expected {CDR!r}")
+                data = self.load(item)
+            except BagError as error:
+                if refused is None:
+                    raise
+                refused[str(error)] += 1
+                continue
+            yield kind, RecordedMessage(topic, kind.type_name, item.time, data, kind.definition, self._decoder_of)
 
 
 def _open(files: list[Path], budget: Budget, progress: Progress) -> tuple[list[BagFile], list[CorruptRegion]]:
