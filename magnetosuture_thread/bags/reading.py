@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from typing import Any, TypeAlias
 
@@ -210,6 +210,11 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, 2.0 * float(np.arctan2(turn.z, turn.w))
 
 
+def plane_points(points: Iterable[Any]) -> Points:
+    """Return points or vectors of a message in the dish plane, shape (m, 2)."""
+    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
+
+
 def path_points(message: Any, field: str = interface.MEASURED_THREAD.name) -> Points:
     """Return a Path as an array of shape (m, 2) [m].
 
@@ -217,7 +222,7 @@ def path_points(message: Any, field: str = interface.MEASURED_THREAD.name) -> Po
         InvalidInputError: wrong frame.
     """
     require_dish_frame(message.header.frame_id, field)
-    return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
+    return plane_points(stamped.pose.position for stamped in message.poses)
 
 
 def path_poses(message: Any, field: str) -> Points:

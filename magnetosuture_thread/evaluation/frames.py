@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.bags.reading import margins_of, nanoseconds, thread_observation
+from magnetosuture_thread.bags.reading import margins_of, nanoseconds, plane_points, thread_observation
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
@@ -359,9 +359,9 @@ class GraphCollector:
             case interface.NEEDLE_POSE.recorded:
                 self.poses += 1
             case interface.MEASURED_THREAD.recorded:
-                self._of(message).measured = _points(stamped.pose.position for stamped in message.poses)
+                self._of(message).measured = plane_points(stamped.pose.position for stamped in message.poses)
             case interface.GROUND_TRUTH_THREAD.recorded:
-                self._of(message).ground_truth = _points(stamped.pose.position for stamped in message.poses)
+                self._of(message).ground_truth = plane_points(stamped.pose.position for stamped in message.poses)
             case interface.GROUND_TRUTH_PULL.recorded:
                 self._of(message).true_pull = _in_plane(message.wrench.force)
             case interface.THREAD_OBSERVATION.recorded:
@@ -376,7 +376,7 @@ class GraphCollector:
                 self._of(message).margins = margins_of(message)
             case interface.PREDICTED_THREAD.recorded:
                 frame = self._of(message)
-                frame.vertices = _points(message.positions)
+                frame.vertices = plane_points(message.positions)
                 frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
                 frame.residual, frame.step_time = message.residual, message.step_time
                 if len(tension := getattr(message, "tension", ())):  # older bags have none
@@ -404,17 +404,13 @@ def _estimate(message: Any) -> EstimatedThread:
         place, direction, since = contact.position, contact.direction, nanoseconds(contact.since) * 1e-9
         vectors, force = (_in_plane(place), _in_plane(direction)), (contact.force, contact.significance)
         disturbances.append(Disturbance(contact.arc_length, contact.extent, *vectors, *force, since))
-    degrees, vertices = int(message.innovation_degrees), _points(message.positions)
+    degrees, vertices = int(message.innovation_degrees), plane_points(message.positions)
     squared = np.full(degrees, message.innovation_squared / max(degrees, 1))
     return EstimatedThread(vertices, not message.prediction_only, squared, tuple(disturbances), message.hidden)
 
 
 def _in_plane(vector: Any) -> Array:
     return np.array([vector.x, vector.y])
-
-
-def _points(points: Iterable[Any]) -> Points:
-    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
 
 
 def rms(values: Array) -> float:

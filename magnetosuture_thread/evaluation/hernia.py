@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.reading import seconds
+from magnetosuture_thread.bags.reading import plane_points, seconds
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.coils.filter import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
@@ -292,8 +292,7 @@ def read_steering(bag: Bag) -> RecordedCommands:
     stamps = np.array([seconds(message.header.stamp) for message in messages])
     if not (np.diff(stamps) >= 0.0).all():
         raise BagError(bag.path, f"has stamps on {OPERATOR_COMMAND.recorded} that do not rise")
-    velocities = np.array([(message.twist.linear.x, message.twist.linear.y) for message in messages])
-    return RecordedCommands(stamps - stamps[0], velocities)
+    return RecordedCommands(stamps - stamps[0], plane_points(message.twist.linear for message in messages))
 
 
 def paper_model(setup: Setup) -> ThreadModelSettings:

@@ -560,10 +560,6 @@ class RunMetrics:
         consistency, hidden = Consistency.of(self.series), HiddenShares.of(self.series)
         return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances))
 
-    def percentiles(self, column: str) -> Percentiles | None:
-        """Return the percentiles of a column."""
-        return Percentiles.of(self.series.column(column))
-
     def maximum(self, column: str) -> float:
         """Return the greatest value of a column; nan if there is none."""
         known = self.series.known(column)

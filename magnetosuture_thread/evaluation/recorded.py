@@ -61,7 +61,7 @@ def read_image(record: RecordedMessage) -> NDArray[np.uint8]:
 def _read_prediction(record: RecordedMessage) -> Points:
     """Return a recorded prediction, shape (n + 1, 2) [m]; shape (0, 2) where it cannot be used."""
     try:
-        vertices = np.array([[point.x, point.y] for point in record.decode().positions]).reshape(-1, 2)
+        vertices = reading.plane_points(record.decode().positions)
     except BagError:
         vertices = np.empty((0, 2))
     return vertices if len(vertices) > 1 and np.isfinite(vertices).all() else np.empty((0, 2))

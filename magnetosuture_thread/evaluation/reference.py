@@ -288,7 +288,13 @@ def score_rig(paths: Sequence[Path], *, segments: int | None = None, progress: P
     body = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
 
     def begin(trajectory: ReferenceTrajectory, path: Path) -> Simulation:
-        thread = _rig_thread(trajectory, path, count)
+        described, _ = reference_thread(trajectory, path, count)
+        stretching = trajectory.metadata["material"].get("EA_N")
+        if not (isinstance(stretching, (int, float)) and 0.0 < stretching < math.inf):
+            raise BagError(path, f"has a thread of the stretching stiffness EA_N {stretching}, expected more than 0 N")
+        medium, stiffness = described.medium, (described.bending_stiffness, float(stretching))
+        drag, joint = (medium.drag_across, medium.drag_along), NeedleJoint(described.attachment.value)
+        thread = ThreadProperties(described.length, count, *stiffness, *drag, joint, described.diameter)
         first, length = trajectory.threads[0], thread.length
         if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - trajectory.tails[0]) > 0.1 * length / count:
             raise BagError(path, "has a first thread of one point, or one that does not begin at the needle's tail")
@@ -354,17 +360,6 @@ def _run_cases(
         )
         results.append(CaseResult(reference, vertices, score))
     return tuple(results)
-
-
-def _rig_thread(trajectory: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
-    """Return the rig's thread that a trajectory's metadata describes, or refuse it."""
-    thread, _ = reference_thread(trajectory, path, segments)
-    stretching = trajectory.metadata["material"].get("EA_N")
-    if not (isinstance(stretching, (int, float)) and 0.0 < stretching < math.inf):
-        raise BagError(path, f"has a thread of the stretching stiffness EA_N {stretching}, expected more than 0 N")
-    drag, joint = (thread.medium.drag_across, thread.medium.drag_along), NeedleJoint(thread.attachment.value)
-    stiffness = thread.bending_stiffness, float(stretching)
-    return ThreadProperties(thread.length, segments, *stiffness, *drag, joint, thread.diameter)
 
 
 def reference_thread(

@@ -87,7 +87,7 @@ def figures_of(metrics: RunMetrics) -> dict[str, Any]:
     errors = metrics.errors()
     return {
         "predicted": len(metrics.series),
-        "step_time": metrics.percentiles("step_time"),
+        "step_time": Percentiles.of(metrics.series.column("step_time")),
         "stretch": metrics.maximum("strain"),
         "seen_share": metrics.mean("seen_share"),
         "error_seen": errors["seen"],
@@ -320,7 +320,8 @@ def row_of(
     minimum = {name: margin.clearance for name, margin in metrics.minimum_margins.items()}
     row |= {f"least_{barrier}_m": minimum.pop(barrier, None) for barrier in BUILT_IN}
     row["least_added_m"] = "; ".join(f"{name}: {clearance:.3e}" for name, clearance in minimum.items()) or None
-    times = {"step": metrics.percentiles("step_time"), "tracker": Percentiles.of(metrics.observed.column("processing"))}
+    columns = {"step": metrics.series.column("step_time"), "tracker": metrics.observed.column("processing")}
+    times = {name: Percentiles.of(column) for name, column in columns.items()}
     times |= {f"latency_{stage.replace(' ', '_')}": (latency or {}).get(stage) for stage in STAGES}
     for name, spread in times.items():
         row[f"{name}_median_s"] = spread.median if spread else None
