@@ -126,25 +126,20 @@ class ObservationReader:
         progress: called with the share done, 0 to 1.
 
     Attributes:
-        source: `camera` or `poses`.
-        count: camera frames, or poses, so far.
-        found: of these with a needle.
-        refused: the others, by why.
+        refused: frames, poses and others that cannot be used, by why.
 
     Raises:
         BagError: while iterating, a length is not in metres, or the bag is damaged.
     """
 
     def __init__(self, bag: BagInput, progress: Progress = lambda share: None) -> None:
-        self.source = bag.source
-        self.count = self.found = 0
         self.refused: Counter[str] = Counter()
         self._bag, self._progress = bag, progress
         self._scene, self._length = bag.setup.scene, bag.setup.model.thread_length
         self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
         channels = [interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, interface.PREDICTED_THREAD, *CHANGING]
-        if bag.recording.camera is not None and self.source == "camera":
+        if bag.recording.camera is not None and bag.source == "camera":
             warm_up()
             self._tracker = TrackerSession(bag.setup.vision, bag.setup.scene)
             channels += bag.recording.camera, interface.CAMERA_INFO, interface.NEEDLE_TIP
@@ -264,7 +259,6 @@ class ObservationReader:
 
     def _pose(self, record: RecordedMessage) -> Observation:
         """Return what a recorded pose says."""
-        self.count += 1
         stamp = stamp_of(record)
         try:
             tail, heading, deviation = reading.read_pose(record)
@@ -272,12 +266,10 @@ class ObservationReader:
             self.refused["a pose that is not valid"] += 1
             return Observation(stamp, reason=str(error))
         self._check_place(record.topic, tail)
-        self.found += 1
         return Observation(stamp, tail, heading, deviation=deviation)
 
     def _track(self, record: RecordedMessage, tracker: TrackerSession) -> tuple[TrackedFrame, Observation]:
         """Track a camera frame; return what is measured, and the observation as `thread_model` would get it."""
-        self.count += 1
         stamp, began = stamp_of(record), time.perf_counter()
         try:
             image = read_image(record)
@@ -292,7 +284,6 @@ class ObservationReader:
             reason = NOT_FOUND if measurement.problem is None else str(measurement.problem)
             self.refused[NOT_NEWER if reason.startswith("image.stamp") else reason] += 1
             return frame, Observation(stamp, reason=track.reason, processing=seconds)
-        self.found += 1
         return frame, Observation(
             stamp,
             np.asarray(track.tail),

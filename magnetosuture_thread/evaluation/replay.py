@@ -90,8 +90,8 @@ def measure_run(
         others = Counter({why: count for why, count in refused.items() if why != recorded.NOT_FOUND})
         reasons = Counter(metrics.reasons) + others
         words = "; ".join(f"{count} times {why}" for why, count in reasons.most_common(3)) or WAITING
-        things = "frames" if reader.source == "camera" else "poses"
-        counts = f"{reader.found} of {reader.count} {things} had a needle"
+        things = "frames" if bag.source == "camera" else "poses"
+        counts = f"{metrics.tracked} of {len(metrics.observed)} {things} had a needle"
         raise BagError(bag.recording.path, f"gave no prediction: {counts}; {words}")
     return MeasuredRun(metrics, refused, reader.thread_problem(), silence, speed)
 
