@@ -274,7 +274,8 @@ class BagWriter:
                 os.fsync(stream.fileno())
         except OSError as error:
             self._fail(error)
-            metadata.unlink(missing_ok=True)  # a part of it would be refused, where readers do without it
+            with suppress(OSError):  # most often there is none
+                metadata.unlink()  # a part of it would be refused, where readers do without it
 
     def _fail(self, problem: OSError) -> None:
         """End the file with the last complete chunk."""
