@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -300,8 +299,6 @@ class Consistency:
         windows: number of windows in which anything was measured.
         windows_within_band: number of windows whose mean is within its band.
         windows_within_band_share: of those in which anything was measured.
-        means: of the normalised innovations squared, shape (k,); nan where nothing was measured.
-        high: upper end of the band of each, shape (k,).
     """
 
     normalised_innovation_squared_mean: float | None = None
@@ -311,8 +308,6 @@ class Consistency:
     windows: int = 0
     windows_within_band: int = 0
     windows_within_band_share: float | None = None
-    means: Array = field(default_factory=partial(np.empty, 0), compare=False)
-    high: Array = field(default_factory=partial(np.empty, 0), compare=False)
 
     @classmethod
     def of(cls, series: TimeSeries) -> Consistency:
@@ -330,7 +325,7 @@ class Consistency:
         means, (low, high) = np.bincount(index, squared * counts, windows) / count, mean_band(count)
         band, mean = np.nanmedian([low, high], axis=1).tolist(), float((squared * counts).sum() / counts.sum())
         known, within = int(np.isfinite(means).sum()), int(((low <= means) & (means <= high)).sum())
-        return cls(mean, band[0], band[1], width, known, within, within / known, means, high)
+        return cls(mean, band[0], band[1], width, known, within, within / known)
 
 
 @dataclass(frozen=True)
@@ -400,8 +395,7 @@ class EstimationFigures:
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none."""
-        consistency = {name: part for name, part in vars(self.consistency).items() if name not in ("means", "high")}
-        figures = {"corrected_frames": self.corrected, "consistency": consistency, **vars(self.hidden)}
+        figures = {"corrected_frames": self.corrected, "consistency": {**vars(self.consistency)}, **vars(self.hidden)}
         return figures | {"disturbances": len(self.disturbances)}
 
 
