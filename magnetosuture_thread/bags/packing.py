@@ -73,8 +73,8 @@ def pack(layout: str, *values: Any) -> bytes:
             spaces. `header` is a stamp in the dish frame, `needle_header` one in the needle's, and `time` a stamp, all
             of type `Stamp`; `text` is a string; numbers have their names in ROS. `float64[]` is a sequence of numbers,
             `float64[9]` an array, whose numbers stand without a count; `points` is an array of shape (m, 2) as a
-            sequence of points or vectors with z = 0; `texts` is a sequence of strings; `{ ... }` is a sequence of
-            messages with the fields between the braces, each message a tuple of their values.
+            sequence of points or vectors with z = 0; `{ ... }` is a sequence of what stands between the braces: of
+            one field its values, of several a tuple of their values for each message.
         values: of the fields.
     """
     data = bytearray(BEGIN)
@@ -92,14 +92,12 @@ def _put_fields(data: bytearray, fields: Fields, values: Sequence[Any]) -> None:
             data += bytes(-len(data) % 4) + struct.pack("<iI", *seconds)
             data += {"header": DISH, "needle_header": NEEDLE, "time": b""}[kind]
         elif kind == "text":
-            _put_text(data, value)
-        elif kind in ("texts", "messages"):
+            content = value.encode() + b"\0"
+            data += bytes(-len(data) % 4) + _COUNT.pack(len(content)) + content
+        elif kind == "messages":
             data += bytes(-len(data) % 4) + _COUNT.pack(len(value))
             for part in value:
-                if kind == "texts":
-                    _put_text(data, part)
-                else:
-                    _put_fields(data, number, part)
+                _put_fields(data, number, part if len(number) > 1 else (part,))
         else:
             _put_numbers(data, kind, number, value)
 
@@ -121,11 +119,6 @@ def _fields(layout: str) -> Fields:
             kind = name if name not in formats else "sequence" if count == "]" else "array" if bracket else "number"
             levels[-1].append((kind, number if kind == "number" else np.dtype(number.format), number.size))
     return tuple(levels[0])
-
-
-def _put_text(data: bytearray, text: str) -> None:
-    content = text.encode() + b"\0"
-    data += bytes(-len(data) % 4) + _COUNT.pack(len(content)) + content
 
 
 def _put_numbers(data: bytearray, kind: str, dtype: np.dtype[Any], values: ArrayLike) -> None:
@@ -246,9 +239,9 @@ def packed_scene(stamp: Stamp, scene: Scene) -> bytes:
     for shape in scene.shapes:
         geometry, discs, polygons = shape.geometry, list[Any](), list[Any]()
         if isinstance(geometry, Disc):
-            discs = [((*geometry.centre, geometry.radius),)]
+            discs = [(*geometry.centre, geometry.radius)]
         else:
-            polygons = [(geometry.outline, [(hole,) for hole in geometry.holes])]
+            polygons = [(geometry.outline, geometry.holes)]
         shapes.append((shape.name, shape.kind, discs, polygons, shape.friction))
     layout = "header text float64 float64 float64 uint8 { text text { float64[3] } { points { points } } float64 }"
     measures = (dish.diameter, dish.depth, dish.wall_friction, SELF_CONTACT[dish.self_contact])
@@ -280,7 +273,7 @@ def packed_observation(stamp: Stamp, observation: ThreadObservation) -> bytes:
         for p in observation.pieces
     ]
     layout = "header { points float64[] uint8 uint8 float64 float64 bool float64 } bool { points }"
-    return pack(layout, stamp, pieces, bool(observation.complete), [(outline,) for outline in observation.hidden])
+    return pack(layout, stamp, pieces, bool(observation.complete), observation.hidden)
 
 
 def packed_prediction(stamp: Stamp, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
@@ -326,7 +319,7 @@ def packed_estimate(stamp: Stamp, estimate: ThreadEstimate) -> bytes:
         disturbances.append(((*numbers, force.force, force.significance), round(force.since * 1e9)))
     return pack(
         "header text points float64[] float64[] bool float64 float64 uint32 float64 uint32 { float64[10] time } "
-        "texts bool float64",
+        "{ text } bool float64",
         *(stamp, estimate.prediction.scene_version, estimate.positions, estimate.deviation),
         *(np.ravel(estimate.covariance), not estimate.corrected, estimate.unmeasured_for, estimate.hidden),
         *(estimate.points, square, degrees, disturbances),
@@ -355,7 +348,7 @@ def packed_margins(
     # As in SafetyMargins.msg.
     source, contact = (0, 0) if margins is None else (1 + of_estimate, 2 if margins.in_contact else 1)
     return pack(
-        "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] "
+        "header text bool text uint8 { text } uint8[] uint32[] int32[] float64[] float64[] float64[] "
         "{ text uint32 int32 float64 float64 float64 } uint8 uint32[] uint8 uint32[] float64",
         *(stamp, known.scene_version, margins is not None, "" if margins is not None else reason, source),
         *([barrier.barrier for barrier in barriers], *columns, rows, contact, known.in_contact),
@@ -374,8 +367,8 @@ def packed_forecast(stamp: Stamp, forecast: Forecast) -> bytes:
     command = forecast.commanded[0] if len(forecast.times) > 1 else (0.0, 0.0)
     margins = list(minima.values())
     return pack(
-        "header text float64[3] float64 bool text float64[] points points points texts float64[] float64[] uint32[] "
-        "texts float64 text uint32 float64 uint32[] float64 texts float64 float64",
+        "header text float64[3] float64 bool text float64[] points points points { text } float64[] float64[] uint32[] "
+        "{ text } float64 text uint32 float64 uint32[] float64 { text } float64 float64",
         *(stamp, forecast.scene_version, (*command, 0.0), forecast.horizon, forecast.converged, forecast.problem),
         *(forecast.times[shown], forecast.tails[shown], forecast.headings[shown]),
         *(forecast.vertices[shown].reshape(-1, 2), list(minima)),
@@ -397,7 +390,7 @@ def time_or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-_CURRENTS = "header texts float64[] time text bool"
+_CURRENTS = "header { text } float64[] time text bool"
 
 
 def packed_currents(stamp: Stamp, command: Stamp | None, output: BridgeOutput) -> bytes:
@@ -418,7 +411,7 @@ def _velocities(output: BridgeOutput) -> tuple[float, ...]:
 
 def packed_filter_state(stamp: Stamp, output: BridgeOutput) -> bytes:
     """Return what became of the command as a FilterState; the stamp is the command's, or the time now without one."""
-    layout = "header text float64[9] float64 texts text text"
+    layout = "header text float64[9] float64 { text } text text"
     end = (output.slowdown, output.active, output.overridden, output.reason)
     return pack(layout, stamp, output.source, _velocities(output), *end)
 
@@ -441,7 +434,7 @@ def packed_bridge_state(stamp: Stamp, system: CoilSystem, driver: DriverState, r
     closed = output is None and not latch.latched_reason
     # As in CoilBridgeState.msg.
     state = 0 if closed else ("UNCONFIGURED", "INACTIVE", "ACTIVE", "FAULT").index(latch.state.name)
-    layout = "header uint8 bool bool text texts float64[12] bool text bool texts float64[] float64[] float64[] "
+    layout = "header uint8 bool bool text { text } float64[12] bool text bool { text } float64[] float64[] float64[] "
     return pack(
         layout + "uint32",
         *(stamp, state, latch.armed, latch.emergency),
