@@ -15,7 +15,7 @@ from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
 from magnetosuture_thread.calibration.result import CalibrationResult, to_yaml
 from magnetosuture_thread.calibration.search import calibrate
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.evaluation.recorded import BagInput, BagSelection, open_bag, setup_of_notes
+from magnetosuture_thread.evaluation.recorded import BagInput, BagSelection, ObservationReader, open_bag, setup_of_notes
 from magnetosuture_thread.evaluation.replay import picture_or_log
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.rig.setups import Setup
@@ -118,7 +118,7 @@ def _read_run(path: Path, bag: BagInput, settings: ThreadModelSettings, against:
     Raises:
         BagError: it cannot be used.
     """
-    observations, simulated = bag.observations(advance), bag.recording.notes.get("simulated", "")
+    observations, simulated = ObservationReader(bag, advance), bag.recording.notes.get("simulated", "")
     try:
         run = read_run(str(path), observations, settings, against, simulated, bag.setup.scene)
     except BagError:

@@ -291,7 +291,7 @@ def _check_poses(bag: recorded.BagInput, log: Log) -> dict[str, Any]:
     """Check recorded poses and threads before any node starts; return `remark`, and what is `refused`."""
     if bag.source == "camera":
         return {}
-    observations = bag.observations()
+    observations = recorded.ObservationReader(bag)
     for _ in observations:
         pass
     if remark := observations.thread_problem():

@@ -408,10 +408,6 @@ class BagInput:
         """Return the notes of a bag made from this one."""
         return {**self.recording.notes, "setup": self.setup.name, "replayed": str(self.recording.path)}
 
-    def observations(self, progress: Progress = lambda share: None) -> ObservationReader:
-        """Return the observations; `progress` is called with the share done, 0 to 1."""
-        return ObservationReader(self, progress)
-
     def check_loop(self) -> None:
         """Raise `BagError` if the bag is too short to be played in a loop."""
         if self.duration < 1.5:  # s; nodes take a jump back of a second and less for messages that come late

@@ -74,7 +74,7 @@ def measure_run(
     Raises:
         BagError: nothing in the bag was predicted.
     """
-    reader = bag.observations(progress)
+    reader = recorded.ObservationReader(bag, progress)
     metrics, refused = RunMetrics(model.thread_length, bag.recording.start, targets), Counter[str]()
     began = time.perf_counter()  # kernels are loaded
     for event in recorded.predictions(reader, model, bag.setup.scene):

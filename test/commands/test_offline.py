@@ -51,7 +51,7 @@ def observed(bag: Path, start: float = 0.0) -> ObservationReader:
     """Return what is observed in a bag."""
     recording = Recording(Bag(bag))
     source = chosen_source(recording, "auto")
-    return BagInput(recording, SETUP, source, start, recording.duration - start).observations(lambda share: None)
+    return ObservationReader(BagInput(recording, SETUP, source, start, recording.duration - start))
 
 
 def without(bag: Path, folder: Path, *topics: str) -> Path:
