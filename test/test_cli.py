@@ -13,38 +13,26 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.cli import COMMANDS
 from magnetosuture_thread.thread.predictor import FORMULATIONS
 from magnetosuture_thread.thread.solvers import SOLVERS
-
-
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the command as a user does."""
-    command = [sys.executable, "-m", "magnetosuture_thread.cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+from test.shared import run_python
 
 
 def test_help_names_every_command_and_the_exit_codes():
-    shown = run("--help")
-    assert shown.returncode == 0
+    shown = run_python("-m", "magnetosuture_thread.cli", "--help")
     for words in (*COMMANDS, "no medical device", "0 done, 1 the job failed, 2 wrong use"):
-        assert words in shown.stdout
+        assert words in shown
 
 
 def test_help_waits_for_no_package_of_a_command():
     slow = "numpy", "numba", "cv2", "scipy", "osqp", "matplotlib", "rclpy"
     look = f"import sys; from magnetosuture_thread import cli; print([name for name in {slow} if name in sys.modules])"
-    shown = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, timeout=300, check=True)
-    assert shown.stdout == "[]\n"
+    assert run_python("-c", look) == "[]\n"
 
 
 WRONG = [
     *("", "dance", "replay bag", "replay bag --output out --rate fast", "replay bag --output out --rate nan"),
     *("render r.npz --output out --setup dish_50mm --seed -1", "simulate dish_50mm --output out --duration -1"),
-    *(
-        "reproduce",
-        "console --graph --replay bag",
-        "console --port some",
-        "track frames --centre 1",
-        "track frames --needle-bright 0.5",
-    ),
+    *("reproduce", "console --graph --replay bag", "console --port some"),
+    *("track frames --centre 1", "track frames --needle-bright 0.5"),
     *("evaluate dir --formulation magic", "evaluate dir --segments 2", "evaluate dir --json /no/such/folder/x.json"),
 ]
 
@@ -86,16 +74,11 @@ def test_signs_that_a_terminal_lacks_end_nothing(encoding: str):
 
 
 def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path, short_bag: Path):
-    with_ros = (
-        "magnetosuture_thread.nodes",
-        "magnetosuture_thread.commands.live",
-        "magnetosuture_thread.commands.simulate",
-    )
-    for name in [name for name in sys.modules if name.startswith(with_ros[0]) or name in with_ros]:
+    with_ros = tuple(f"magnetosuture_thread.{name}" for name in ("nodes", "commands.live", "commands.simulate"))
+    for name in [name for name in sys.modules if name.startswith(with_ros)]:
         monkeypatch.delitem(sys.modules, name)
-    for name in [name for name in sys.modules if name.split(".")[0] == "rclpy"]:
+    for name in ["rclpy", *(name for name in sys.modules if name.startswith("rclpy."))]:
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, "rclpy", None)
     assert cli.main(["replay", str(short_bag), "--output", str(tmp_path / "out")]) == 1
     assert "nodes and the live graph need ROS 2 Jazzy" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

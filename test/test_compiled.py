@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread.geometry.compiled import compiled_inline, source_digest
+from test.shared import run_python
 
 
 def test_the_digest_of_kernels_is_of_every_file_that_they_depend_on(tmp_path: Path):
@@ -54,11 +55,7 @@ def test_code_of_before_is_not_run_and_nothing_has_to_be_writable(tmp_path: Path
 
     def run(factor: str, **places: str) -> str:
         script.write_text(KERNEL.format(factor=factor))
-        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **places}
-        done = subprocess.run(
-            [sys.executable, script], env=environment, check=True, timeout=600, stdout=subprocess.PIPE, text=True
-        )
-        return done.stdout.strip()
+        return run_python(script, environment={"PYTHONDONTWRITEBYTECODE": "1", **places}).strip()
 
     places = {"NUMBA_CACHE_DIR": str(cache)}
     results = [run("2.0", **places), run("2.0", **places), run("4.0", **places)]
@@ -95,8 +92,7 @@ print(outer(21.0), double(21.0), outer(21.0), double(21.0))
 def test_a_kernel_without_a_wrapper_can_be_called_from_python(tmp_path: Path):
     """By numba itself that is a crash of the process."""
     (tmp_path / "inner.py").write_text(INNER)
-    done = subprocess.run([sys.executable, tmp_path / "inner.py"], check=True, timeout=600, stdout=subprocess.PIPE)
-    assert done.stdout == b"43.0 42.0 43.0 42.0\n"
+    assert run_python(tmp_path / "inner.py") == "43.0 42.0 43.0 42.0\n"
 
 
 def test_without_jit_the_same_is_predicted(tmp_path: Path):
@@ -110,12 +106,7 @@ predictor.start(NeedlePose(0.0, (0.0, 0.0), (1.0, 0.0)))
 prediction = pickle.loads(pickle.dumps(predictor)).step(NeedlePose(0.02, (0.0, 1e-4), (0.6, 0.8)))
 print(prediction.converged, prediction.positions.round(12).tolist(), prediction.tension.round(12).tolist())
 """
-    shown = []
-    for switch in ("0", "1"):
-        environment = {**os.environ, "NUMBA_DISABLE_JIT": switch}
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, env=environment, check=True, timeout=600, stdout=subprocess.PIPE, text=True)
-        shown.append(done.stdout)
+    shown = [run_python("-c", code, environment={"NUMBA_DISABLE_JIT": switch}) for switch in ("0", "1")]
     assert shown[0] == shown[1]
     assert shown[0].startswith("True ")
 
@@ -136,10 +127,8 @@ with event.install_recorder("numba:compile") as compilations:
     numba.njit(lambda x: x)(1.0)
 print(count, len(compilations.buffer) > count)
 """
-    command = [sys.executable, "-c", code]
-    for _ in range(2):
-        done = subprocess.run(command, check=True, timeout=300, stdout=subprocess.PIPE, text=True)
-    assert done.stdout == "0 True\n"
+    shown = [run_python("-c", code) for _ in range(2)]
+    assert shown[1] == "0 True\n"
 
 
 def test_a_number_that_is_written_out_compiles_nothing_again():

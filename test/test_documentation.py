@@ -20,8 +20,8 @@ from magnetosuture_thread.planning.procedure import parse_procedure
 from magnetosuture_thread.rig.setups import SETTINGS_CLASSES
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import ROS_PARAMETERS, configuration_fields
+from test.shared import ROOT, known
 
-ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [README, *DOCS]
@@ -59,8 +59,7 @@ def shell_lines(page: Path) -> list[str]:
 def first_column(page: Path, heading: str) -> list[str]:
     """Return the first cells of the first table after a heading."""
     section = page.read_text().partition(heading)[2]
-    found = re.search(r"(?:^\|.*\n)+", section, re.MULTILINE)
-    assert found is not None, heading
+    found = known(re.search(r"(?:^\|.*\n)+", section, re.MULTILINE))
     return [line.strip("|").split("|")[0].strip().strip("`") for line in found[0].splitlines()[2:]]
 
 

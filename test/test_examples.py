@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 
 import pytest
 
 from test.examples import FOLDER
+from test.shared import run_python
 
 pytestmark = pytest.mark.slow
 
@@ -30,9 +29,4 @@ SAYS = {
 def test_an_example_runs(name: str):
     path = FOLDER / f"{name}.py"
     assert len(path.read_text().splitlines()) <= LINES
-    done = subprocess.run(
-        [sys.executable, path.name], cwd=FOLDER, timeout=300, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert re.search(SAYS[name], done.stdout)
+    assert re.search(SAYS[name], run_python(path.name, cwd=FOLDER))

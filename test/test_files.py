@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,6 +16,7 @@ from magnetosuture_thread.geometry.scene_files import write_scene
 from magnetosuture_thread.settings.errors import BagError, RecordingEndedError
 from magnetosuture_thread.settings.files import input_problem, output_problem, read_regular, whole_file, whole_folder
 from test.bags.bags import STRING, read, texts, write_mcap, write_rosbag
+from test.shared import run_python
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
@@ -119,9 +118,7 @@ print(*(oct(path.stat().st_mode & 0o777) for path in (file, folder, folder / "fi
 
 @pytest.mark.parametrize(("umask", "modes"), [("077", "0o600 0o700 0o600"), ("002", "0o664 0o775 0o664")])
 def test_outputs_have_the_permissions_that_the_umask_says(tmp_path: Path, umask: str, modes: str):
-    command = [sys.executable, "-c", MODES, str(tmp_path), umask]
-    shown = subprocess.run(command, check=True, timeout=60, capture_output=True, text=True)
-    assert shown.stdout.strip() == modes
+    assert run_python("-c", MODES, tmp_path, umask).strip() == modes
 
 
 def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 
 import magnetosuture_thread
 from magnetosuture_thread.nodes.program import MAKERS
+from test.shared import run_python
 
 PACKAGE = Path(magnetosuture_thread.__file__).parent
 
@@ -129,21 +129,21 @@ def test_what_is_installed_needs_nothing_of_the_source_tree():
 LATE = {"matplotlib", "scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.stats"}
 
 
+def loaded_by(modules: Iterable[str]) -> set[str]:
+    """Return the names of all modules that a process has after it has imported some of the package."""
+    code = "import sys, " + ", ".join(f"magnetosuture_thread.{name}" for name in modules) + "; print(*sys.modules)"
+    return set(run_python("-c", code).split())
+
+
 @pytest.mark.parametrize(("modules", "allowed"), [(sorted(MAKERS), set[str]()), (["console"], {"aiohttp"})])
 def test_a_node_needs_no_library_for_plots_bags_or_pages(modules: list[str], allowed: set[str]):
     """Only the node that serves the page has that of its server."""
     unneeded = {"matplotlib", "rich", "rosbags", "mcap", "lz4", "zstandard", "pyarrow", "aiohttp"}
-    code = (
-        "import sys, " + ", ".join(f"magnetosuture_thread.nodes.{name}" for name in modules) + "; print(*sys.modules)"
-    )
-    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
-    assert unneeded & set(found.stdout.split()) == allowed
+    assert unneeded & loaded_by(f"nodes.{name}" for name in modules) == allowed
 
 
 def test_what_few_need_delays_no_start():
     """Each of these takes a third of a second or more to import, and a graph is many processes."""
     modules = ["nodes.scene_server", "nodes.rig_simulator", "nodes.perception", "nodes.coil_bridge"]
     modules += ["nodes.path_follower", "nodes.console", "commands.simulate", "commands.replay", "commands.campaign"]
-    code = "import sys, " + ", ".join(f"magnetosuture_thread.{name}" for name in modules) + "; print(*sys.modules)"
-    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
-    assert not LATE & set(found.stdout.split())
+    assert not LATE & loaded_by(modules)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import configparser
-import importlib.util
 import os
 import re
 import shlex
@@ -26,8 +25,8 @@ from magnetosuture_thread.settings.interface import (
     RIG_NODES,
     STANDBY_NODES,
 )
+from test.shared import ROOT, load_module
 
-ROOT = Path(__file__).parent.parent
 INSTALLED: dict[str, str] = {}  # packages of the ROS installation
 LIFECYCLE = {"perception", "coil_bridge", *(set(STANDBY_NODES) & set(ALL_NODES) - set(NODES))}
 AUTOSTART = next(a.quantity.choices for a in configuration_fields(CoilBridgeSettings) if a.name == "autostart")
@@ -72,16 +71,9 @@ def description(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         "launch_ros.actions": {"Node": kept("node")},
     }
     for name, contents in modules.items():
-        module = ModuleType(name)
-        for entry, value in contents.items():
-            setattr(module, entry, value)
-        monkeypatch.setitem(sys.modules, name, module)
-    spec = importlib.util.spec_from_file_location("launched", ROOT / "launch" / "magnetosuture.launch.py")
-    assert spec is not None
-    assert spec.loader is not None
-    launched = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(launched)
-    return list(launched.generate_launch_description())
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+        vars(sys.modules[name]).update(contents)
+    return list(load_module(ROOT / "launch" / "magnetosuture.launch.py").generate_launch_description())
 
 
 def nodes(description: list[Any], **arguments: str) -> list[Any]:

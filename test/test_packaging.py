@@ -16,9 +16,9 @@ from catkin_pkg.packages import find_packages
 
 import magnetosuture_thread
 from magnetosuture_thread.settings.errors import missing_module
+from test.shared import ROOT, known
 from test.test_imports import MODULES, imported
 
-ROOT = Path(__file__).parent.parent
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
 INSTALLATION = (ROOT / "docs" / "how_to" / "installation.md").read_text()
 
@@ -29,15 +29,13 @@ def package_xml(path: Path) -> ElementTree.Element:
 
 
 def test_the_version_is_the_same_everywhere():
-    version = re.search(r'^version = "(.+)"$', PYPROJECT, re.MULTILINE)
-    assert version is not None
+    version = known(re.search(r'^version = "(.+)"$', PYPROJECT, re.MULTILINE))
     for path in (ROOT / "package.xml", ROOT / "msg_defs" / "package.xml"):
         assert package_xml(path).findtext("version") == version[1]
     assert magnetosuture_thread.__version__ == version[1]
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version[1]
-    assert re.search(
-        rf"^## \[{re.escape(version[1])}\] - \d{{4}}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
-    )
+    heading = rf"^## \[{re.escape(version[1])}\] - \d{{4}}-\d\d-\d\d$"
+    assert re.search(heading, (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
 
 
 LINK = "ln -sfn magnetosuture_thread/msg_defs src/magnetosuture_msgs"
@@ -73,8 +71,7 @@ def test_every_message_is_built():
 
 def test_every_import_has_a_key_of_rosdep_or_is_in_the_list_for_pip():
     keys = {entry.text for tag in ("depend", "exec_depend") for entry in package_xml(ROOT / "package.xml").iter(tag)}
-    line = re.search(r"^ +pip install --break-system-packages (.+)$", INSTALLATION, re.MULTILINE)
-    assert line is not None
+    line = known(re.search(r"^ +pip install --break-system-packages (.+)$", INSTALLATION, re.MULTILINE))
     by_pip = {re.split("[^a-z0-9]", word)[0] for word in shlex.split(line[1])}
     own = {"magnetosuture_thread", "typing_extensions"}  # the latter for mypy only
     cluster = {"dask", "distributed", "pyarrow", "upath"}
@@ -111,8 +108,7 @@ def test_colcon_installs_programs_version_launch_file_and_settings(tmp_path: Pat
     subprocess.run(["colcon", "build", *layout.split()], cwd=tmp_path, env=environment, check=True, timeout=600)
     prefix = tmp_path / "install" / ("" if layout == "--merge-install" else "magnetosuture_thread")
     programs, share = prefix / "lib" / "magnetosuture_thread", prefix / "share" / "magnetosuture_thread"
-    listed = re.search(r"^\[project\.scripts\]\n((?:.+\n)+)", PYPROJECT, re.MULTILINE)
-    assert listed is not None
+    listed = known(re.search(r"^\[project\.scripts\]\n((?:.+\n)+)", PYPROJECT, re.MULTILINE))
     assert {path.name for path in programs.iterdir()} == set(re.findall(r"^(\w+) =", listed[1], re.MULTILINE))
     assert (share / "launch" / "magnetosuture.launch.py").is_file()
     assert (share / "config" / "hernia_ring.yaml").is_file()

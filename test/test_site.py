@@ -11,9 +11,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from test.shared import ROOT
+
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[1]
 LOADED = {"audio": "src", "iframe": "src", "img": "src", "script": "src", "source": "src", "video": "src"}
 
 

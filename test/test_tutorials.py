@@ -26,12 +26,11 @@ from typing import NamedTuple
 import pytest
 
 from test.commands.test_calibrate_coils import probe
-from test.test_documentation import shell_lines
+from test.shared import ROOT
+from test.test_documentation import README, shell_lines
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[1]
-README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs/tutorials").glob("*.md"))]
 BLOCK = re.compile(r"^(?:<!-- (file|runs): ([^\n]*) -->\n)?```(bash|python|yaml)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 TIMEOUT = 300.0  # s
@@ -73,8 +72,7 @@ def run(block: Block, folder: Path) -> None:
         return
     shell = ["bash", "-euo", "pipefail", "-c"]
     command = [*(shell if block.language == "bash" else [sys.executable, "-c"]), block.text]
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path}
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     if block.runs.startswith("until "):
         run_until(block.runs.removeprefix("until "), command, folder, environment)
         return
@@ -143,14 +141,9 @@ NOT_HERE = re.compile(r"magnetosuture (coils|console|compile)|s3://|tcp://|BAG -
 LIVE = re.compile(r"simulate|replay (?!.*--offline)|thread-behavior")
 PLACES = {
     **dict.fromkeys(("BAG", "FRAMES_OR_BAG", "RUNS"), "examples/post_wrap"),
-    **{
-        "D": "0.035",
-        "DIR": "made",
-        "NEW": "made",
-        "PROCEDURE": "dead_end",
-        "NAME": "dead_end",
-        "FOLDER_OR_VIDEO": "made",
-    },
+    **dict.fromkeys(("DIR", "NEW", "FOLDER_OR_VIDEO"), "made"),
+    **dict.fromkeys(("PROCEDURE", "NAME"), "dead_end"),
+    "D": "0.035",
 }
 
 NEEDLE_PX = {"--tail": ("505", "153"), "--tip": ("439", "97")}  # in the first frame of the example bag

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,8 +12,8 @@ from magnetosuture_msgs.msg import BarrierMargin
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from magnetosuture_thread.nodes import topics
+from test.shared import ROOT
 
-ROOT = Path(__file__).parent.parent
 VIEWERS = ROOT / "config" / "viewers"
 RVIZ = yaml.safe_load((VIEWERS / "magnetosuture.rviz").read_text())["Visualization Manager"]
 FOXGLOVE: dict[str, Any] = json.loads((VIEWERS / "foxglove.json").read_text())

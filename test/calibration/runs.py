@@ -18,6 +18,7 @@ from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.thread.prediction import NeedlePose
+from test.shared import known
 
 SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, max_step=0.07)  # one step a pose
 SILK = ThreadModelSettings(material="silk_6_0", thread_length=0.15, segments=30, max_step=0.07)
@@ -53,9 +54,8 @@ def rig_run(ratio: float, duration: float = 6.0, phase: float = 0.0, clamped: bo
         if index:
             rig.drive(tail, heading, 1.0 / RATE)
         curve = points_at(rig.thread, np.linspace(0.0, LENGTH, 64))
-        found.append(
-            Observation(round((1.0 + time) * 1e9), tail, np.array([math.cos(heading), math.sin(heading)]), curve, curve)
-        )
+        way = np.array([math.cos(heading), math.sin(heading)])
+        found.append(Observation(round((1.0 + time) * 1e9), tail, way, curve, curve))
     return tuple(found)
 
 
@@ -82,8 +82,7 @@ def model_run(
         tail, angle = path(index / RATE, scale, period)
         heading = np.array([math.cos(angle), math.sin(angle)])
         outcome = session.on_pose(stamp, NeedlePose(stamp * 1e-9, tail, heading))
-        assert outcome.prediction is not None
-        found.append(Observation(stamp, tail, heading, outcome.prediction.positions))
+        found.append(Observation(stamp, tail, heading, known(outcome.prediction).positions))
     return tuple(found)
 
 

@@ -13,6 +13,7 @@ import pytest
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.geometry.scene_files import read_scene, write_scene
 from test.geometry.scene.scenes import every_shape
+from test.shared import known
 
 HOSTILE = """\
 dish: {diameter: 0.035, depth: 0.003}
@@ -48,8 +49,7 @@ def test_a_picture_shows_every_shape_in_its_place(tmp_path: Path):
     root = ElementTree.parse(tmp_path / "lab.svg").getroot()
     words = {"".join(text.itertext()).strip() for text in root.iter("{http://www.w3.org/2000/svg}text")}
     assert {"lab", *every_shape().names, "10 mm", "tissue", "instrument", "wall"} <= words
-    picture = cv2.imread(str(tmp_path / "lab.png"))
-    assert picture is not None
+    picture = known(cv2.imread(str(tmp_path / "lab.png")))
     height, width, _ = picture.shape
     scale = width / (1.12 * 0.05)  # px/m
     x, y = -0.003, 0.013  # in the block of tissue

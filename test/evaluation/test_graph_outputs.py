@@ -13,6 +13,7 @@ from magnetosuture_thread.evaluation.frames import CurrentSeries, GraphCollector
 from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
 from magnetosuture_thread.evaluation.tables import LoopCollector
 from magnetosuture_thread.settings.errors import GraphError
+from test.shared import known
 
 STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])
 UP = np.array([0.0, 0.01])
@@ -89,9 +90,7 @@ def test_latencies_pair_stamps():
     published = {"camera/image_raw/compressed": {1: 0.0, 2: 1.0}, "needle/servo_cv": {1: 0.5}}
     arrived = {"needle/measured_cp": {1: 0.01, 2: 1.03}, "thread/predicted": {2: 1.04}, "coils/currents": {7: 0.1}}
     found = stage_latencies(published, arrived, applied={1})
-    pose, step = found["frame to needle pose"], found["pose to prediction"]
-    assert pose is not None
-    assert step is not None
+    pose, step = known(found["frame to needle pose"]), known(found["pose to prediction"])
     assert (pose.median, pose.maximum, step.median) == pytest.approx((0.02, 0.03, 0.01))
     assert found["command to currents"] is None
 
@@ -107,8 +106,7 @@ def series(*currents: tuple[float, list[float], str]) -> CurrentSeries:
 def test_currents_are_compared_with_those_in_force():
     recorded = series((1.0, [1.0, 0.0], ""), (1.01, [2.0, 0.0], ""), (1.02, [3.0, 0.0], "no command"))
     replayed = series((1.013, [2.5, 0.0], ""), (1.0199, [2.0, 0.0], ""), (1.03, [3.0, 0.0], ""))
-    found = replayed.against(recorded)
-    assert found is not None
+    found = known(replayed.against(recorded))
     assert (found.compared, found.greatest, found.difference) == (3, 0.5, 0.0)
     assert found.recorded == pytest.approx((17.0 / 6.0) ** 0.5)
     assert found.stopped_apart == pytest.approx(1.0 / 3.0)
@@ -165,9 +163,7 @@ def test_errors_are_against_the_truth_of_the_same_frame():
     assert (summary.path_error, summary.path_error_greatest) == pytest.approx((2e-4, 2e-4))
     assert (summary.frames, summary.tracked, summary.lost, summary.wrong) == (4, 4, 0, 0)
     assert summary.duration == pytest.approx(0.03)
-    latency = summary.latency["needle/measured_cp"]
-    assert latency is not None
-    assert latency.median == pytest.approx(0.005)
+    assert known(summary.latency["needle/measured_cp"]).median == pytest.approx(0.005)
 
 
 @pytest.mark.parametrize(

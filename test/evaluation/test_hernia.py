@@ -17,6 +17,7 @@ from magnetosuture_thread.cli import main
 from magnetosuture_thread.evaluation import hernia
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.rig.setups import read_setup
+from test.shared import known
 
 pytestmark = pytest.mark.slow
 
@@ -26,8 +27,7 @@ STEERING = EXAMPLES / "hernia_steering"
 
 def test_picture_and_animation_show_the_run(run: hernia.HerniaRun, tmp_path: Path):
     (tmp_path / "hernia.png").write_bytes(hernia.draw_hernia(run))
-    picture = cv2.imread(str(tmp_path / "hernia.png"))
-    assert picture is not None
+    picture = known(cv2.imread(str(tmp_path / "hernia.png")))
     for blue, green, red in ((84, 158, 31), (80, 166, 240)):  # a free thread, and one under friction, in BGR
         assert (np.abs(picture.astype(int) - (blue, green, red)).max(axis=2) < 40).sum() > 50
     (tmp_path / "hernia.gif").write_bytes(hernia.draw_animation(replace(run, instants=run.instants[:30])))
@@ -91,13 +91,12 @@ def test_the_thread_goes_around_the_ring_and_is_tight_on_it(run: hernia.HerniaRu
 
 def test_the_needle_goes_where_it_is_told_and_slower_under_friction(run: hernia.HerniaRun):
     for last, instant in pairwise(run.instants):
-        assert instant.command is not None
-        slowdown = last.margins.friction.slowdown
-        assert instant.command.slowdown == slowdown
+        command, slowdown = known(instant.command), last.margins.friction.slowdown
+        assert command.slowdown == slowdown
         moved = (instant.prediction.positions[0] - last.prediction.positions[0]) * 33.0
-        np.testing.assert_allclose(moved, instant.command.filtered, atol=1e-9)
-        if set(instant.command.active) <= {"friction"}:
-            np.testing.assert_allclose(instant.command.filtered, slowdown * instant.command.commanded, atol=1e-9)
+        np.testing.assert_allclose(moved, command.filtered, atol=1e-9)
+        if set(command.active) <= {"friction"}:
+            np.testing.assert_allclose(command.filtered, slowdown * command.commanded, atol=1e-9)
 
 
 def test_no_node_is_ever_in_an_obstacle_and_no_segment_stretched(run: hernia.HerniaRun):

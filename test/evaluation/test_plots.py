@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import draw_metrics
 from test.evaluation.runs import EVIL, LENGTH, NODES, made_metrics
+from test.shared import run_python
 
 
 def test_a_run_without_a_camera_is_drawn_on_a_plan():
@@ -30,6 +29,5 @@ def test_a_run_without_a_camera_is_drawn_on_a_plan():
 
 def test_a_command_draws_whatever_backend_a_notebook_asks_for(tmp_path):
     code = "from magnetosuture_thread import cli; cli.main(['scene', 'draw', 'dish_35mm', '--output', 'dish.png'])"
-    environment = {"MPLBACKEND": "module://there_is.none", "HOME": str(tmp_path)}
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300, cwd=tmp_path, env=environment)
+    run_python("-c", code, cwd=tmp_path, environment={"MPLBACKEND": "module://there_is.none", "HOME": str(tmp_path)})
     assert (tmp_path / "dish.png").read_bytes().startswith(b"\x89PNG")

@@ -27,6 +27,7 @@ from magnetosuture_thread.forecast import NeedleDrag
 from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.thread.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
+from test.shared import known
 
 EAST = np.array([1.0, 0.0])
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=1e-5)
@@ -108,13 +109,13 @@ def test_forecast_equals_stepping_by_hand(attachment: Attachment, friction: floa
     assert len(expected) == round(HORIZON / STEP)
     rubbed = False
     for k, (velocity, prediction, nodes) in enumerate(expected):
-        assert prediction.forces is not None
+        forces = known(prediction.forces)
         np.testing.assert_allclose(forecast.filtered[k], velocity, rtol=0.0, atol=1e-10)
         np.testing.assert_allclose(forecast.vertices[k + 1], prediction.positions, rtol=0.0, atol=1e-9)
         assert tuple(np.flatnonzero(forecast.friction[k + 1]).tolist()) == nodes
         rubbed = rubbed or bool(nodes)
-        assert forecast.tension[k + 1] == pytest.approx(prediction.forces.peak_tension, rel=1e-4, abs=1e-9)
-        np.testing.assert_allclose(forecast.needle_force[k + 1], prediction.forces.needle_force, rtol=1e-4, atol=1e-9)
+        assert forecast.tension[k + 1] == pytest.approx(forces.peak_tension, rel=1e-4, abs=1e-9)
+        np.testing.assert_allclose(forecast.needle_force[k + 1], forces.needle_force, rtol=1e-4, atol=1e-9)
         for name in ("obstacle", "wall", "connectivity", "compression"):
             near = min(prediction.margins[name].minimum_clearance, 1e-3)
             assert min(forecast.margins[name][k + 1], 1e-3) == pytest.approx(near, abs=2e-9)
@@ -177,8 +178,7 @@ def test_needle_that_is_driven_against_a_shape_comes_to_rest_there():
     forecaster = ThreadForecaster(thread(), where, NeedleSafetyFilter(where, keep_out=5e-4))
     start = forecaster.straight(NeedlePose(0.0, np.array([0.003, 0.0]), EAST))
     forecast = forecaster.forecast(start, 0.002 * EAST, 5.0)
-    assert forecast.rest_time is not None
-    assert 0.5 < forecast.rest_time < 4.0  # 1.5 mm at 2 mm/s, the last of it slower and slower
+    assert 0.5 < known(forecast.rest_time) < 4.0  # 1.5 mm at 2 mm/s, the last of it slower and slower
     assert forecast.stopped_by == ("post",)
     assert forecast.minima["needle"].shape == "post"
     assert 0.0 < forecast.minima["needle"].value < 1e-5
@@ -199,8 +199,8 @@ def test_needle_with_drag_moves_by_the_balance_of_command_and_pull():
     free, drawn = (each.forecast(start, turning, steps * STEP) for each in (exact, pulled))
     turns = [math.atan2(each.headings[-1, 1], each.headings[-1, 0]) for each in (free, drawn)]
     assert 0.1 * turns[0] < turns[1] < 0.95 * turns[0]
-    balance = drawn.needle_force[-1] @ np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
-    across = turning @ np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
+    left = np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
+    balance, across = drawn.needle_force[-1] @ left, turning @ left
     rate = (math.atan2(*drawn.headings[-1][::-1]) - math.atan2(*drawn.headings[-2][::-1])) / STEP
     assert rate == pytest.approx(across / 0.0035 - 0.0035 * balance / 1.6e-7, rel=0.1)
     still = pulled.forecast(replace(start, vertices=start.vertices), np.zeros(2), 0.2)
@@ -213,8 +213,7 @@ def test_first_contact_names_shape_and_time():
     forecaster = ThreadForecaster(thread(80), where, NeedleSafetyFilter(where))
     start = forecaster.straight(NeedlePose(0.0, np.zeros(2), EAST))
     forecast = forecaster.forecast(start, np.array([0.0, 0.003]), 3.0)
-    contact = forecast.first_contact
-    assert contact is not None
+    contact = known(forecast.first_contact)
     assert contact.shape == "post"
     before = forecast.margins["obstacle"][: round(contact.time / STEP)]
     assert before.min() > 2e-6

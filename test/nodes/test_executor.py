@@ -16,6 +16,7 @@ from rclpy.task import Future
 
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
 from magnetosuture_thread.nodes.processes import reserved_domain
+from test.shared import wait_until
 
 
 @contextmanager
@@ -25,10 +26,7 @@ def spun(context: Any) -> Iterator[tuple[KeptWaitSetExecutor, Any, Callable[...,
     executor.add_node(node)
 
     def until(condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 30.0
-        while not condition():
-            assert time.monotonic() < deadline
-            executor.spin_once(timeout_sec=0.1)
+        wait_until(lambda: condition() or executor.spin_once(timeout_sec=0.1) or condition(), "the condition")
 
     yield executor, node, until
     executor.shutdown()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import xml.etree.ElementTree as ElementTree
 from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -22,10 +19,11 @@ from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.settings import interface
 from test.nodes.conftest import Graph
 from test.nodes.makers import EVERY_NODE
+from test.shared import ROOT, load_module
 
-ROOT = Path(__file__).parents[2]
 CHANNELS = {name: value for name, value in vars(interface).items() if isinstance(value, interface.Channel)}
 SECURITY = ROOT / "config" / "security"
+REFERENCE = load_module(ROOT / "docs" / "generated_reference.py")
 INCLUDE = "{http://www.w3.org/2001/XInclude}include"
 Rights = dict[str, set[str]]  # names by what may be done with them
 # What a node has under other parameters only: raw frames, and simulated time.
@@ -103,22 +101,12 @@ def check(graph: Graph, node: str) -> None:
     assert actual() == {right: names for right, names in expected.items() if names}
 
 
-def reference() -> ModuleType:
-    """Return the module that writes the reference."""
-    spec = importlib.util.spec_from_file_location("generated_reference", ROOT / "docs" / "generated_reference.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("name", EVERY_NODE)
 def test_a_node_has_on_the_graph_what_reference_and_policies_say_and_no_more(graph: Graph, name: str):
     make, parameters = EVERY_NODE[name]
     node = graph.add(make, **parameters)
     check(graph, name)
-    published, received = reference().traffic_of(name)
+    published, received = REFERENCE.traffic_of(name)
     ends = {way: {each.topic_name for each in getattr(node, way)} for way in ("publishers", "subscriptions")}
     assert {key for key, channel in CHANNELS.items() if channel.recorded in ends["publishers"]} <= published
     assert {key for key, channel in CHANNELS.items() if channel.recorded in ends["subscriptions"]} <= received | {
@@ -140,7 +128,7 @@ def test_all_that_a_node_has_is_in_its_namespace(graph: Graph):
 
 
 def test_every_topic_has_an_end_in_the_graph():
-    traffic = [reference().traffic_of(name) for name in (*EVERY_NODE, "console")]
+    traffic = [REFERENCE.traffic_of(name) for name in (*EVERY_NODE, "console")]
     assert {name for published, received in traffic for name in published | received} == set(CHANNELS)
 
 

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -39,6 +36,7 @@ from magnetosuture_thread.vision.tracker import State, Track
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 from test.geometry.scene.scenes import every_shape
 from test.nodes import wire
+from test.shared import run_python
 
 STAMP = Time(sec=3, nanosec=500_000_000)
 TAIL, HEADING = np.array([1e-3, -2e-3]), np.array([-0.6, 0.8])
@@ -195,10 +193,8 @@ print(pose.header.frame_id, image.header.frame_id)
 
 @pytest.mark.parametrize("prefix", ["ab/", "abc/", "left_1/", "right_1/"])  # what follows is aligned by their lengths
 def test_the_frames_of_a_rig_with_a_prefix_are_its_own(prefix: str):
-    environment = {**os.environ, interface.FRAME_PREFIX_VARIABLE: prefix}
-    command = [sys.executable, "-c", IN_A_RIG_WITH_A_PREFIX]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, f"{prefix}dish {prefix}camera\n"), done.stderr
+    shown = run_python("-c", IN_A_RIG_WITH_A_PREFIX, environment={interface.FRAME_PREFIX_VARIABLE: prefix})
+    assert shown == f"{prefix}dish {prefix}camera\n"
 
 
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))

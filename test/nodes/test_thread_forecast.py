@@ -24,6 +24,7 @@ from magnetosuture_thread.thread.material import MATERIALS, Attachment
 from test.estimator.threads import whole
 from test.nodes import wire
 from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
+from test.shared import known
 
 HORIZON = 0.6
 
@@ -92,8 +93,7 @@ def test_the_message_says_what_happens_when():
     start = forecaster.straight(NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0])))
     forecast = forecaster.forecast(ForecastStart(start.pose, start.vertices), np.array([0.0, 0.003]), 2.0)
     message = topics.FORECAST.decode(packed_forecast(stamp(0), forecast))
-    contact = forecast.first_contact
-    assert contact is not None
+    contact = known(forecast.first_contact)
     assert (message.contact_time, message.contact_shape, message.contact_node) == (contact.time, "post", contact.node)
     assert message.clearance[0] == forecast.minima["obstacle"].value
     assert message.clearance_shape[0] == "post"
@@ -108,10 +108,8 @@ def test_a_client_is_told_what_happens_along_its_path(graph: Any, monkeypatch: p
     forecasts = graph.listen(topics.FORECAST)
     heading, tail = WAY[0].heading, WAY[0].tail
     ahead = [Point(x=x, y=y) for x, y in (tail + np.outer([0.012, 0.03], heading)).tolist()]
-    assert (
-        "no estimate yet"
-        in graph.call(ForecastPath, Service.FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.0).message
-    )
+    refused = graph.call(ForecastPath, Service.FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.0)
+    assert "no estimate yet" in refused.message
     bench.show(0)
     graph.wait(lambda: len(forecasts) == 1, "a forecast")
     answer = graph.call(ForecastPath, Service.FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.2)

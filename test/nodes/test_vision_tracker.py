@@ -13,6 +13,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.vision.lens import Lens
+from test.shared import known
 from test.vision.scenes import rod
 
 TAIL = np.array([0.002, 0.001])
@@ -117,11 +118,9 @@ def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
 
 def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_not_used(graph):
     case, image = frame_of("distortion", 2, 31)
-    lens = case.lens
-    assert lens is not None
     node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
-    message = camera_info(lens)
+    message = camera_info(known(case.lens))
     graph.publish(topics.CAMERA_INFO, message)
     graph.wait(lambda: node._lens is not None, "the lens")  # messages of two topics come in either order
     graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
@@ -142,8 +141,7 @@ def test_frames_of_a_topic_that_is_rectified_are_not_undistorted_again(graph):
             super().__init__(cli_args=["--ros-args", "--remap", rule], **options)
 
     case, _ = frame_of("distortion", 2, 31)
-    assert case.lens is not None
     node = graph.add(Remapped, scene="dish_35mm", confirm_frames=1)
-    graph.publish(topics.CAMERA_INFO, camera_info(case.lens))
+    graph.publish(topics.CAMERA_INFO, camera_info(known(case.lens)))
     graph.wait(lambda: node._lens is not None, "the lens")
     assert node._session._tracker._lens is None

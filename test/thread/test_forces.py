@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
+from test.shared import known
 
 RATE = 66.0
 
@@ -28,8 +29,7 @@ def test_a_straight_thread_pulled_along_itself(attachment: str, segments: int):
     assert predictor.start(pose(0.0, (0.0, 0.0), (1.0, 0.0))).forces is None
     speed = 2e-3
     for k in range(1, 40):
-        forces = predictor.step(pose(k / RATE, (speed * k / RATE, 0.0), (1.0, 0.0))).forces
-    assert forces is not None
+        forces = known(predictor.step(pose(k / RATE, (speed * k / RATE, 0.0), (1.0, 0.0))).forces)
     thread, middles = predictor.thread, (np.arange(segments) + 0.5) * predictor.thread.segment_length
     drag = thread.medium.drag_along * speed
     assert forces.tension == pytest.approx(drag * (thread.length - middles), rel=1e-5)
@@ -47,8 +47,7 @@ def test_a_clamped_thread_in_a_cross_flow_turns_the_needle_as_a_beam_does(side: 
     predictor = ThreadPredictor(replace(thread, medium=replace(thread.medium, flow=flow)))
     predictor.start(pose(0.0, (0.0, 0.0), (1.0, 0.0)))
     for k in range(1, 11):
-        forces = predictor.step(pose(20.0 * k, (0.0, 0.0), (1.0, 0.0))).forces
-    assert forces is not None
+        forces = known(predictor.step(pose(20.0 * k, (0.0, 0.0), (1.0, 0.0))).forces)
     assert forces.needle_moment == pytest.approx(-0.5 * side * load * thread.length**2, rel=0.02)
 
 
@@ -61,12 +60,9 @@ def test_contact_drag_and_needle_are_in_balance():
     for k in range(1, 150):
         angle = 0.012 * k
         tail = 6e-3 * math.sin(angle), 6e-3 - 6e-3 * math.cos(angle)
-        before = predictor.state
+        before = known(predictor.state)
         prediction = predictor.step(pose(k / RATE, tail, (math.cos(angle), math.sin(angle))))
-    forces, state = prediction.forces, predictor.state
-    assert forces is not None
-    assert before is not None
-    assert state is not None
+    forces, state = known(prediction.forces), known(predictor.state)
     pressed = np.linalg.norm(forces.contact, axis=1)
     assert pressed.max() > 1e-6
     touching = np.flatnonzero(pressed > 0.0)

@@ -19,6 +19,7 @@ from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
+from test.shared import known
 
 THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
 
@@ -28,16 +29,14 @@ def pose(stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> Ne
     return NeedlePose(stamp, np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]))
 
 
-def new(
-    obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = (), formulation: str = "rod"
-) -> ThreadPredictor:
+def new(obstacles: tuple[Disc | Polygon, ...] = (), **options: Any) -> ThreadPredictor:
     """Return a predictor that has not started."""
-    return ThreadPredictor(THREAD, Workspace(obstacles, 5e-3), formulation=formulation, fixed_nodes=fixed_nodes)
+    return ThreadPredictor(THREAD, Workspace(obstacles, 5e-3), **options)
 
 
-def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = ()) -> ThreadPredictor:
+def started(obstacles: tuple[Disc | Polygon, ...] = (), **options: Any) -> ThreadPredictor:
     """Return a predictor of a thread that lies straight behind the needle."""
-    predictor = new(obstacles, fixed_nodes)
+    predictor = new(obstacles, **options)
     predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
     return predictor
 
@@ -51,8 +50,7 @@ def test_space_is_refused_at_the_start_in_the_plane_and_works_in_a_workspace_of_
     assert predictor.start(east).tension is None
     prediction = predictor.step(NeedlePose(0.02, np.array([1e-4, 0.0, 1e-4]), np.eye(3)[0]))
     assert prediction.converged
-    assert prediction.forces is not None
-    assert prediction.tension is prediction.forces.tension
+    assert prediction.tension is known(prediction.forces).tension
     moving = NeedlePose(0.04, np.zeros(3), np.eye(3)[0], motion=NeedleMotion(np.zeros(3), 0.0))
     with pytest.raises(InvalidInputError, match="expected None, as it turns in the plane only"):
         predictor.step(moving)
@@ -138,8 +136,7 @@ def test_margins_do_not_depend_on_what_was_near_before():
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
 @pytest.mark.parametrize("segments", [3.0, 24.0])
 def test_a_needle_that_jumps_by_many_segments_is_followed(segments: float, formulation: str):
-    predictor = new(formulation=formulation)
-    predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
+    predictor = started(formulation=formulation)
     jump = segments * THREAD.segment_length
     prediction = predictor.step(pose(1.0 / 60.0, -jump, 0.2 * jump))
     assert prediction.substeps >= 2.0 * segments

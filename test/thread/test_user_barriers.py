@@ -26,6 +26,7 @@ from magnetosuture_thread import (
 )
 from magnetosuture_thread.geometry.barrier import load_barriers
 from test.examples import FOLDER, load_example
+from test.shared import known
 
 TipKeepIn = load_example("barriers/tip_keep_in").TipKeepIn
 CurvatureBound = load_example("barriers/curvature_bound").CurvatureBound
@@ -54,11 +55,8 @@ class EndsApart(Barrier):
 def around(step: int) -> NeedlePose:
     """Return a needle that drives a circle of 4 mm at 6 mm/s."""
     angle = 0.025 * step
-    return NeedlePose(
-        step / 60.0,
-        0.004 * np.array([math.sin(angle), 1.0 - math.cos(angle)]),
-        np.array([math.cos(angle), math.sin(angle)]),
-    )
+    tail = 0.004 * np.array([math.sin(angle), 1.0 - math.cos(angle)])
+    return NeedlePose(step / 60.0, tail, np.array([math.cos(angle), math.sin(angle)]))
 
 
 def predicted(*barriers: Barrier, steps: int = 150, **options: Any) -> list[Prediction]:
@@ -134,14 +132,12 @@ def test_a_barrier_knows_where_the_needle_is():
         name, most = "left_of_needle", 2e-3
 
         def value(self, positions: np.ndarray) -> np.ndarray:
-            assert self.needle is not None
-            tail, (x, y) = self.needle
+            tail, (x, y) = known(self.needle)
             off = positions[-1] - tail
             return np.array([self.most - x * off[1] + y * off[0]])
 
         def gradient(self, positions: np.ndarray) -> Gradient:
-            assert self.needle is not None
-            _, (x, y) = self.needle
+            _, (x, y) = known(self.needle)
             return Gradient(np.array([[len(positions) - 1]]), np.array([[[y, -x]]]))
 
     least_margins = []
@@ -169,8 +165,7 @@ def test_a_failed_row_leaves_the_thread_where_it_was():
     barrier.broken = True
     with pytest.raises(InvalidInputError, match="moving_disc"):
         predictor.step(around(2))
-    assert predictor.state is not None
-    np.testing.assert_array_equal(predictor.state.positions, before.positions)
+    np.testing.assert_array_equal(known(predictor.state).positions, before.positions)
     barrier.broken = False
     assert predictor.step(around(3)).interval == pytest.approx(2.0 / 60.0)
 

@@ -10,6 +10,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.vision.dish import SCALE_ERROR, DishWatch, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.shared import known
 from test.vision.scenes import NOWHERE, Pose, finger, render
 
 
@@ -24,8 +25,7 @@ def gray_of(centre: tuple[float, float], scale: float, seed: int, lighting: Ligh
 )
 @pytest.mark.parametrize("lighting", [Lighting(), Lighting(gain=0.5, slope=4.0, noise=3.0)])
 def test_the_dish_is_found_to_a_quarter_of_a_pixel(centre, scale: float, seed: int, lighting: Lighting):
-    found = see_dish(gray_of(centre, scale, seed, lighting), VisionTrackerSettings(), 0.035)
-    assert found is not None
+    found = known(see_dish(gray_of(centre, scale, seed, lighting), VisionTrackerSettings(), 0.035))
     assert found.scale_error == SCALE_ERROR
     assert np.linalg.norm(np.subtract(found.view.centre_px, centre)) < 0.25
     assert found.view.metres_per_pixel == pytest.approx(scale, rel=6e-3)
@@ -33,8 +33,7 @@ def test_the_dish_is_found_to_a_quarter_of_a_pixel(centre, scale: float, seed: i
 
 def test_a_hand_over_a_third_of_the_rim_does_not_move_the_dish():
     frame = render(Pose(np.zeros(2), 0.3), covers=(finger(np.array([0.008, 0.0]), 0.0, 0.024, (120.0, 150.0, 200.0)),))
-    found = see_dish(frame, VisionTrackerSettings(), 0.035)
-    assert found is not None
+    found = known(see_dish(frame, VisionTrackerSettings(), 0.035))
     assert np.linalg.norm(np.subtract(found.view.centre_px, (322.0, 238.0))) < 0.5
     assert found.view.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)
 
@@ -61,8 +60,7 @@ def test_a_clear_dish_on_a_dark_bench_is_in_doubt_by_its_wall_and_lid(inner: flo
 
     light = 25.0 + 90.0 * disc(1.0, 4.0) + 25.0 * (disc(0.97, 4.0) - disc(inner + 0.02, 1.0)) - 8.0 * disc(inner, 0.0)
     light = cv2.GaussianBlur(light, (0, 0), 0.9) + random.standard_normal(light.shape) * 1.5
-    found = see_dish(np.clip(light, 0.0, 255.0).astype(np.uint8), VisionTrackerSettings(), 0.09)
-    assert found is not None
+    found = known(see_dish(np.clip(light, 0.0, 255.0).astype(np.uint8), VisionTrackerSettings(), 0.09))
     assert not found.dark_field
     seen = 0.045 / found.view.metres_per_pixel / radius
     assert abs(seen / inner - 1.0) < found.scale_error + 0.005  # the truth is within the doubt

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.settings.errors import InvalidInputError
-from magnetosuture_thread.vision.images import (
-    decode_image,
-    unpack_image,
-)
+from magnetosuture_thread.vision.images import decode_image, unpack_image
 
 BLUE, GREEN, RED = 40, 120, 200
 # What a pixel of this colour is in YUV, by ITU-R BT.601 with 16 to 235 for black to white.

@@ -13,14 +13,8 @@ import pytest
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
-from test.vision.scenes import (
-    PIXEL,
-    SCENE,
-    VIEW,
-    Pose,
-    line_error,
-    render,
-)
+from test.shared import known
+from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, line_error, render
 
 SAMPLES = Path(__file__).parent / "samples"
 TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
@@ -29,13 +23,11 @@ TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
 @pytest.mark.parametrize("given_view", [True, False])
 def test_the_sample_frames_are_measured_to_half_a_pixel_and_a_degree(given_view: bool):
     truth = json.loads((SAMPLES / "truth.json").read_text())
-    known = VisionTrackerSettings(dish_centre_px=(322.0, 238.0), metres_per_pixel=8e-5)
-    tracker = VisionTracker(known if given_view else VisionTrackerSettings(), SCENE)
+    given = VisionTrackerSettings(dish_centre_px=(322.0, 238.0), metres_per_pixel=8e-5)
+    tracker = VisionTracker(given if given_view else VisionTrackerSettings(), SCENE)
     tails, angles, tips, lines = [], [], [], []
     for frame in truth["frames"]:
-        image = cv2.imread(str(SAMPLES / frame["file"]))
-        assert image is not None
-        seen = tracker.look(image)
+        seen = tracker.look(known(cv2.imread(str(SAMPLES / frame["file"]))))
         assert seen.state is State.TRACKED, seen.reason
         pose = Pose(VIEW.to_dish(np.array(frame["tail_px"])), frame["heading_rad"])
         apart, turned = pose.error(seen)
@@ -77,7 +69,7 @@ def test_what_is_no_image_is_refused(image: np.ndarray):
 def test_a_given_view_by_which_the_dish_is_smaller_than_any_frame_finds_no_dish():
     tiny = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=25.0 * PIXEL)
     seen = VisionTracker(tiny, SCENE).look(render(Pose(np.array([0.003, -0.002]), 0.8)))
-    assert seen.view is not None
+    assert known(seen.view)
     assert "correct metres_per_pixel" in seen.reason
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
+
+from test.shared import run_python
 
 SWEEP = """
 import importlib, pkgutil
@@ -49,5 +48,4 @@ for number, name in enumerate(list(CLASSES)[::3]):
 @pytest.mark.slow
 def test_no_frame_compiles_anything_after_the_warm_up():
     # In a process of its own, as the other tests have compiled what they need.
-    done = subprocess.run([sys.executable, "-c", SWEEP], capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
+    run_python("-c", SWEEP)

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.coils.needle_motion import ROUNDING, project_onto_half_planes
+from test.shared import known
 
 NUMBERS = st.floats(-1.0, 1.0)
 
@@ -39,8 +40,7 @@ def missing(rows: np.ndarray, least: np.ndarray, points: np.ndarray) -> np.ndarr
 @given(problem=half_planes())
 def test_what_is_found_is_within_and_nothing_within_is_nearer(problem: tuple[np.ndarray, np.ndarray, np.ndarray]):
     point, rows, least = problem
-    found = nearest_in_half_planes(point, rows, least)
-    assert found is not None
+    found = known(nearest_in_half_planes(point, rows, least))
     assert missing(rows, least, found[None]).max() <= 1.01 * ROUNDING * np.linalg.norm(point) + 1e-18
     angle = np.linspace(0.0, 2.0 * np.pi, 721)
     way = np.column_stack([np.cos(angle), np.sin(angle)])

@@ -7,13 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread import (
-    Barrier,
-    Gradient,
-    InvalidInputError,
-    NeedleSafetyFilter,
-    Scene,
-)
+from magnetosuture_thread import Barrier, Gradient, InvalidInputError, NeedleSafetyFilter, Scene
 from test.examples import load_example
 
 MovingDisc = load_example("barriers/moving_disc").MovingDisc

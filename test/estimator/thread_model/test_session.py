@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +19,7 @@ from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObs
 from magnetosuture_thread.settings.configuration import from_mapping
 from magnetosuture_thread.thread.margins import Friction, FrictionState
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from test.shared import known, run_python
 from test.thread.worlds import polygon, scene_with
 
 EAST = np.array([1.0, 0.0])
@@ -51,8 +50,7 @@ def go(session: ThreadSession, stamp: float, x: float = 0.0, y: float = 0.0, ang
 def predicted(outcome: PredictionResult) -> Prediction:
     """Return the prediction that there must be."""
     assert outcome.problem is None
-    assert outcome.prediction is not None
-    return outcome.prediction
+    return known(outcome.prediction)
 
 
 def seen(x: float = 0.0, y: float = 0.0) -> Points:
@@ -111,10 +109,8 @@ def test_the_thread_hangs_where_it_is_fixed(offset: list[float], attachment: str
         angle = 0.02 * k
         prediction = predicted(go(session, 1.0 + k / 30.0, 1e-4 * k, 0.0, angle))
         along, left = offset
-        expected = [
-            1e-4 * k + along * np.cos(angle) - left * np.sin(angle),
-            along * np.sin(angle) + left * np.cos(angle),
-        ]
+        e = np.array([np.cos(angle), np.sin(angle)])
+        expected = 1e-4 * k * EAST + along * e + left * np.array([-e[1], e[0]])
         np.testing.assert_allclose(prediction.positions[0], expected, atol=1e-12)
     assert np.abs(prediction.strain).max() < 1e-3
 
@@ -141,9 +137,7 @@ def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
     away = np.linalg.norm(last.positions[1:], axis=1).max()
     assert away < 0.01 - 30e-6 + 1e-6
     assert formulation == "paper" or away > 0.0099  # in which a thread that is pushed shrinks instead
-    margins = outcomes[-1].margins
-    assert margins is not None
-    assert formulation == "paper" or margins.in_contact
+    assert formulation == "paper" or known(outcomes[-1].margins).in_contact
 
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
@@ -211,8 +205,7 @@ for values, around in (
         assert outcome.prediction is None or outcome.prediction.margins
 print(kernels() - before)
 """
-    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
-    assert found.stdout.strip() == "0"
+    assert run_python("-c", code).strip() == "0"
 
 
 def half_seen(first: PieceEnd) -> ThreadObservation:
@@ -235,17 +228,14 @@ def gated(first: int, last: int, session: ThreadSession, speed: float, x: float)
     """Drive a needle east [m/s] from x [m]; return where it is then, and the friction."""
     for k in range(first, last):
         outcome = go(session, 1.0 + k / 30.0, x + speed * (k - first) / 30.0)
-        assert outcome.margins is not None
-        friction = outcome.margins.friction
+        friction = known(outcome.margins).friction
     return x + speed * (last - 1 - first) / 30.0, friction
 
 
 def test_friction_slows_a_needle_that_pulls_and_no_other_and_a_change_of_settings_keeps_the_motion():
     """Between two discs, 0.8 mm from the thread on either side, 6 mm behind the needle."""
-    gate, values = (
-        scene_with(Disc((-0.006, 0.0018), 0.001), Disc((-0.006, -0.0018), 0.001)),
-        {"friction_threshold": 1.2e-3},
-    )
+    gate = scene_with(Disc((-0.006, 0.0018), 0.001), Disc((-0.006, -0.0018), 0.001))
+    values = {"friction_threshold": 1.2e-3}
     model, averaged = straight(gate, friction_averaging=0.0, **values), straight(gate, **values)
     x, pulled = gated(0, 5, model, 3e-3, 0.0)
     assert pulled.state is FrictionState.SLIDING
@@ -262,11 +252,6 @@ def test_friction_slows_a_needle_that_pulls_and_no_other_and_a_change_of_setting
 RATE = 60.0
 PLACE, ANGLE = 1e-5, 5e-3  # m and rad; deviations of a tracked needle
 SPEED, RADIUS = 4e-3, 6e-3  # m/s and m; of a needle on a circle
-
-
-def eastward(stamp: float, x: float) -> NeedlePose:
-    """Return the exact pose of a needle that heads east on the x axis."""
-    return NeedlePose(stamp, np.array([x, 0.0]), np.array([1.0, 0.0]))
 
 
 def on_circle(time: float) -> NeedlePose:
@@ -290,11 +275,10 @@ def test_velocity_and_pose_of_a_needle_on_a_circle(seed: int):
         filtered.append(motion.update(measured(on_circle(k / RATE), random)))
     errors, shifts, turnings = [], [], []
     for pose in filtered[60:]:
-        exact = on_circle(pose.stamp)
-        assert pose.motion is not None
-        errors.append((pose.motion.velocity - SPEED * exact.heading) / pose.deviation[0])
+        exact, found = on_circle(pose.stamp), known(pose.motion)
+        errors.append((found.velocity - SPEED * exact.heading) / pose.deviation[0])
         shifts.append((pose.tail - exact.tail) / pose.deviation[0])
-        turnings.append(pose.motion.turning)
+        turnings.append(found.turning)
     # As good as its own covariance says, and better than a difference of poses, of 0.85 mm/s.
     assert 0.7 < np.sqrt(np.mean(np.square(shifts))) < 1.3
     assert filtered[-1].deviation[0] < 0.8 * PLACE
@@ -307,12 +291,10 @@ def test_the_pull_of_a_session_is_that_of_the_needle_and_not_of_noise():
     random, settings = np.random.default_rng(7), ThreadModelSettings(initial_shape="straight", estimator=False)
     session, pulls = ThreadSession(settings, None), []
     for k in range(300):
-        exact = eastward(k / RATE, SPEED * k / RATE)
+        exact = NeedlePose(k / RATE, SPEED * k / RATE * EAST, EAST)
         result = session.on_pose(round(1e9 * k / RATE), measured(exact, random))
-        assert result.prediction is not None
         if k > 60:
-            assert result.prediction.forces is not None
-            pulls.append(result.prediction.forces.needle_force)
+            pulls.append(known(known(result.prediction).forces).needle_force)
     drag = session.thread.medium.drag_along * session.thread.length * SPEED
     off = np.linalg.norm(np.array(pulls) + np.array([drag, 0.0]), axis=1) / drag
     assert np.sqrt(np.mean(off**2)) < 0.06

@@ -17,6 +17,7 @@ from magnetosuture_thread.settings.configuration import from_mapping
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.prediction import NeedlePose
 from test.estimator.threads import LENGTH, error_percent, piece_of, poses, thread_of, true_shapes, whole
+from test.shared import known
 from test.thread.worlds import scene_with
 
 WAY = poses(45)
@@ -52,8 +53,7 @@ def follow(session: ThreadSession, first: int = 0, last: int = len(WAY)) -> list
 
 def estimated(result: PredictionResult) -> ThreadEstimate:
     assert result.estimate_problem is None
-    assert result.estimate is not None
-    return result.estimate
+    return known(result.estimate)
 
 
 def test_every_frame_has_an_estimate_beside_the_prediction_of_the_model_alone():
@@ -62,17 +62,12 @@ def test_every_frame_has_an_estimate_beside_the_prediction_of_the_model_alone():
     assert len(results) == len(WAY)
     assert [result.estimate for result in others] == [None] * len(WAY)
     for result, other in zip(results, others, strict=True):
-        assert result.prediction is not None
-        assert other.prediction is not None
-        np.testing.assert_array_equal(result.prediction.positions, other.prediction.positions)
-        assert estimated(result).stamp == result.prediction.stamp
-    last = results[-1]
-    assert last.prediction is not None
-    assert error_percent(last.prediction.positions, NODES[-1]) > 2.0 * error_percent(
-        estimated(last).positions, NODES[-1]
-    )
-    assert last.margins is not None
-    np.testing.assert_array_equal(last.margins["wall"].clearance, estimated(last).margins["wall"].clearance)
+        prediction = known(result.prediction)
+        np.testing.assert_array_equal(prediction.positions, known(other.prediction).positions)
+        assert estimated(result).stamp == prediction.stamp
+    last = estimated(results[-1])
+    assert error_percent(prediction.positions, NODES[-1]) > 2.0 * error_percent(last.positions, NODES[-1])
+    np.testing.assert_array_equal(known(results[-1].margins)["wall"].clearance, last.margins["wall"].clearance)
 
 
 @pytest.mark.parametrize("values", [{"formulation": "paper"}, {"medium": "air"}])
@@ -155,6 +150,6 @@ def test_a_scene_that_appears_pushes_the_estimate_out():
     scene = scene_with(post)
     session.change(session.settings, scene)
     result = session.on_pose(stamp_of(WAY[30]), at(WAY[30]))
-    assert result.margins is not None
-    assert result.margins.scene_version == scene.version
-    assert result.margins["obstacle"].minimum > -1e-6
+    margins = known(result.margins)
+    assert margins.scene_version == scene.version
+    assert margins["obstacle"].minimum > -1e-6

@@ -14,6 +14,7 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
+from test.shared import known
 from test.thread.worlds import scene_with
 
 
@@ -59,8 +60,7 @@ def test_the_attachments_velocity_is_the_rate_of_its_place():
             NeedlePose(1.0 + time, time * velocity, heading, motion=NeedleMotion(velocity, rate))
         )
 
-    motion = after(0.0).motion
-    assert motion is not None
+    motion = known(after(0.0).motion)
     np.testing.assert_allclose(motion.velocity, (after(step).tail - after(-step).tail) / (2.0 * step), rtol=1e-6)
 
 

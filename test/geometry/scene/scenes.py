@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
-
-import pytest
 
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.scene_files import scene_from_mapping
@@ -24,16 +21,6 @@ SHAPES: dict[str, Any] = {
         "kind": "tissue",
     },
 }
-
-
-def check_refused(kind: type[Exception], read: Callable[[], Any], start: str, most: int = 500) -> None:
-    """Check that something is refused in one short line that begins with some words."""
-    with pytest.raises(kind) as caught:
-        read()
-    text = str(caught.value)
-    assert text.startswith(start)
-    assert "\n" not in text
-    assert len(text) < most
 
 
 def every_shape() -> Scene:

@@ -10,7 +10,8 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.geometry.scene_files import read_scene, write_scene
 from magnetosuture_thread.settings.errors import ConfigurationError
-from test.geometry.scene.scenes import SHAPES, check_refused, every_shape
+from test.geometry.scene.scenes import SHAPES, every_shape
+from test.shared import check_refused
 
 DISH = "dish: {diameter: 0.035, depth: 0.003}\n"
 
@@ -56,7 +57,7 @@ BAD = [
 def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: str, words: str):
     path = tmp_path / "bad.yaml"
     path.write_text(text)
-    check_refused(ConfigurationError, lambda: read_scene(str(path)), f"{path}: {words}", 500 + len(str(path)))
+    check_refused(ConfigurationError, lambda: read_scene(str(path)), f"{path}: {words}", most=500 + len(str(path)))
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "a\0b", "x" * 5000, "../config/scenes/dish_35mm"])

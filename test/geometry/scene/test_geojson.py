@@ -15,7 +15,8 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.geometry.scene_files import read_scene, scene_from_geojson, scene_to_geojson
 from magnetosuture_thread.settings.errors import ConfigurationError
-from test.geometry.scene.scenes import check_refused, every_shape
+from test.geometry.scene.scenes import every_shape
+from test.shared import check_refused
 
 SQUARE = [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01], [0.0, 0.0]]
 DISH = {"diameter": 0.05, "depth": 0.004}
@@ -136,7 +137,7 @@ NO_JSON = [
 def test_bad_geojson_is_refused_in_one_line_that_names_file_feature_and_field(tmp_path: Path, text: str, words: str):
     path = tmp_path / "bad.geojson"
     path.write_text(text)
-    check_refused(ConfigurationError, lambda: read_scene(str(path)), f"{path}: {words}", 500 + len(str(path)))
+    check_refused(ConfigurationError, lambda: read_scene(str(path)), f"{path}: {words}", most=500 + len(str(path)))
 
 
 @pytest.mark.parametrize(("features", "parts"), [(1, 5000), (100, 50)])

@@ -17,7 +17,8 @@ from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.settings.interface import SCENE
-from test.geometry.scene.scenes import check_refused, every_shape
+from test.geometry.scene.scenes import every_shape
+from test.shared import check_refused
 
 LARGE = Polygon(
     tuple((0.01 * np.cos(a), 0.01 * np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 1500, endpoint=False))
@@ -83,7 +84,7 @@ DAMAGE: list[tuple[Callable[[Any], None], str]] = [
 def test_a_damaged_message_is_refused_in_one_line(harm: Callable[[Any], None], words: str):
     message = recorded(every_shape())
     harm(message)
-    check_refused(InvalidInputError, lambda: reading.parse_scene_message(message), words, 400)
+    check_refused(InvalidInputError, lambda: reading.parse_scene_message(message), words, most=400)
 
 
 def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it():

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.geometry.scene_files import ARC_TOLERANCE, shape_from_mapping
 from magnetosuture_thread.settings.errors import ConfigurationError
-from test.geometry.scene.scenes import check_refused
+from test.shared import check_refused
 
 HALF_PI = 0.5 * math.pi
 
