@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,11 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread.bags.message_types import own_definition, typestore
+from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.interface import SCENE, Channel
 
 HEADER = "std_msgs/msg/Header"
 STRING = "std_msgs/msg/String"
@@ -131,23 +134,42 @@ def chunks_of(path: Path) -> Iterator[tuple[int, int, list[Message]]]:
             yield index.chunk_start_offset, index.chunk_start_offset + index.chunk_length, messages
 
 
-def copy_with_notes(bag: Path, folder: Path, **notes: str) -> None:
-    """Copy a bag to a folder, with further notes."""
-    old = Bag(bag)
-    with BagWriter(folder, {**old.notes, **notes}) as new:
-        numbers = {connection: new.add_connection(connection) for connection in old.connections()}
-        for item in old.stored():
-            new.write_to(numbers[item.connection], item.time, item.data)
+def changed(
+    bag: Path,
+    folder: Path,
+    change: Callable[[RecordedMessage, Any], Any] = lambda old, message: message,
+    added: Iterable[tuple[Channel, int, Any]] = (),
+    notes: Mapping[str, str] | None = None,
+) -> Path:
+    """Write a bag again.
 
-
-def changed(bag: Path, folder: Path, change: Callable[[RecordedMessage, Any], Any]) -> Path:
-    """Write a bag again, each message as it comes out of a function; those that come out as None are left out."""
-    source = Bag(bag)
-    with BagWriter(folder, source.notes) as writer:
-        for topic, type_name in source.topics.items():
+    Args:
+        bag: that is there.
+        folder: of the new one.
+        change: makes of each message another one; those that come out as None are left out.
+        added: further messages, with their channels and times [ns].
+        notes: in place of the bag's own.
+    """
+    source, added = Bag(bag), list(added)
+    with BagWriter(folder, source.notes if notes is None else notes) as writer:
+        own = {channel.recorded: channel.type_name for channel, _, _ in added}
+        for topic, type_name in {**source.topics, **own}.items():
             writer.add_topic(topic, type_name)
+        for channel, time, message in added:
+            writer.write_message(channel.recorded, time, message)
         for old in source.records(set(source.topics)):
-            message = change(old, old.decode())
-            if message is not None:
+            if (message := change(old, old.decode())) is not None:
                 writer.write_message(old.topic, old.time, message)
     return folder
+
+
+def copy_with_notes(bag: Path, folder: Path, **notes: str) -> None:
+    """Copy a bag to a folder, with further notes."""
+    changed(bag, folder, notes={**Bag(bag).notes, **notes})
+
+
+def scene_message(time: int, scene: Scene, version: str = "") -> Any:
+    """Return the message of a scene, of its own version unless another is named."""
+    message: Any = typestore().deserialize_cdr(packed_scene(time, scene), SCENE.type_name)
+    message.version = version or message.version
+    return message

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import struct
-import subprocess
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +21,7 @@ from magnetosuture_thread.bags.storage import Budget, MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import STRING, cdr, read, texts, write_mcap
+from test.shared import run_python
 
 PATH = "nav_msgs/msg/Path"
 
@@ -100,10 +99,9 @@ def test_no_bomb_takes_more_than_it_may(tmp_path: Path):
     for name, make in BOMBS.items():
         (tmp_path / name).mkdir()
         paths.append(str(make(tmp_path / name)))
-    done = subprocess.run([sys.executable, "-c", CHECK, *paths], capture_output=True, text=True, timeout=900)
-    assert "Traceback" not in done.stderr
-    results = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("RESULT")]
-    assert len(results) == len(BOMBS), done.stderr
+    lines = run_python("-c", CHECK, *paths, warns=True).splitlines()
+    results = [line.split()[1:] for line in lines if line.startswith("RESULT")]
+    assert len(results) == len(BOMBS)
     assert {code for code, _, _ in results} <= {"0", "1"}
     peaks = {name: int(peak) for name, (_, peak, _) in zip(BOMBS, results, strict=True)}
     assert max(peaks.values()) < MAX_MEGABYTES, peaks
@@ -166,8 +164,7 @@ def write(folder: Path, size: int) -> Path:
 
 
 def test_memory_is_flat(tmp_path: Path):
-    folders = [str(write(tmp_path / name, size)) for name, size in (("small", 500_000), ("large", 100_000_000))]
-    command = [sys.executable, "-c", READER, *folders]
-    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.split()
+    folders = [write(tmp_path / name, size) for name, size in (("small", 500_000), ("large", 100_000_000))]
+    said = run_python("-c", READER, *folders).split()
     assert said[2] == "2000"
     assert float(said[3]) < float(said[1]) + LIMIT

@@ -10,7 +10,7 @@ import random
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from mcap.writer import CompressionType, IndexType
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.settings.errors import BagError
-from test.bags.bags import SECOND, STRING, Message, cdr, chunks_of, read, texts, write_many_chunks, write_mcap
+from test.bags.bags import SECOND, STRING, cdr, chunks_of, read, texts, write_many_chunks, write_mcap
+from test.shared import known
 
 Untouched = Callable[[int, int], bool]
 
@@ -92,8 +93,7 @@ def test_no_flipped_bit_passes_on_a_wrong_value(whole: Whole, tmp_path: Path):
     places = [chance.randrange(size) for _ in range(120)]
     for place in (*places, *range(start, start + 60), *range(size - 1200, size, 7), *range(0, 130, 4)):
         bag = whole.judge(tmp_path / "flip.mcap", flipped(whole.data, place, chance), outside(place, place + 1))
-        assert bag is not None
-        assert bag.damage is not None, f"byte {place} is not noticed"
+        assert known(bag).damage is not None, f"byte {place} is not noticed"
 
 
 def test_cut_bags_and_bytes_put_in_or_taken_away(whole: Whole, tmp_path: Path):
@@ -105,9 +105,7 @@ def test_cut_bags_and_bytes_put_in_or_taken_away(whole: Whole, tmp_path: Path):
         # What says that a bag is simulated must not be the first that goes.
         assert cut is None or (cut.damage is not None and cut.notes == whole.notes != {})
         grown = whole.data[:place] + chance.randbytes(size) + whole.data[place:]
-        bag = whole.judge(tmp_path / "grown.mcap", grown, outside(place, place))
-        assert bag is not None
-        assert bag.damage is not None
+        assert known(whole.judge(tmp_path / "grown.mcap", grown, outside(place, place))).damage is not None
         shrunk = whole.data[:place] + whole.data[place + size :]
         whole.judge(tmp_path / "shrunk.mcap", shrunk, outside(place, place + size))
 
@@ -117,29 +115,25 @@ def test_chunks_that_are_swapped_or_there_twice(whole: Whole, tmp_path: Path):
     swapped = whole.data[:a] + whole.data[c:d] + whole.data[b:c] + whole.data[a:b] + whole.data[d:]
     twice = whole.data[:d] + whole.data[a:d] + whole.data[d:]
     for data in (swapped, twice, twice[:-200], whole.data + whole.data):
-        bag = whole.judge(tmp_path / "moved.mcap", data, lambda a, b: True)
-        assert bag is not None
+        bag = known(whole.judge(tmp_path / "moved.mcap", data, lambda a, b: True))
         assert bag.damage is not None
         assert Counter(read(bag)) == whole.messages
     # A copy that destroys a chunk, so that there are as many as the summary counts.
     within = (whole.chunks[15][0] + whole.chunks[15][1]) // 2
     data = whole.data[:within] + whole.data[a:b] + whole.data[within:]
-    bag = whole.judge(tmp_path / "moved.mcap", data, outside(within, within))
-    assert bag is not None
-    assert bag.damage is not None
+    assert known(whole.judge(tmp_path / "moved.mcap", data, outside(within, within))).damage is not None
 
 
 def test_damage_says_where_and_when(whole: Whole, tmp_path: Path):
     start, end, messages = whole.chunks[7]
     bag = whole.judge(tmp_path / "one.mcap", flipped(whole.data, end - 5, random.Random(2)), lambda a, b: a != start)
-    assert bag is not None
-    assert bag.damage is not None
-    assert (bag.damage.chunks, bag.damage.messages) == (1, len(messages))
-    (place,) = bag.damage.regions
+    damage = known(known(bag).damage)
+    assert (damage.chunks, damage.messages) == (1, len(messages))
+    (place,) = damage.regions
     before, after = (max(time for _, time, _ in whole.chunks[6][2]), min(time for _, time, _ in whole.chunks[8][2]))
     assert (place.start, place.first, place.last) == (start, before, after)
-    assert f"{len(messages)} messages in 1 chunk are lost" in str(bag.damage)
-    assert "\n" not in str(bag.damage)
+    assert f"{len(messages)} messages in 1 chunk are lost" in str(damage)
+    assert "\n" not in str(damage)
 
 
 @settings(max_examples=60, deadline=None)
@@ -245,10 +239,7 @@ def test_a_record_that_is_not_what_it_says_is_damage(
     change(path)
     bag = Bag(path)
     assert bag.damage is not None
-    expected: Iterable[Message] = (
-        m for number, chunk in enumerate(chunks) for m in chunk[2] if number != 2 or not lost
-    )
-    assert read(bag) == list(expected)
+    assert read(bag) == [m for number, chunk in enumerate(chunks) for m in chunk[2] if number != 2 or not lost]
 
 
 @pytest.mark.parametrize("kind", ["truncated", "no checksums"])

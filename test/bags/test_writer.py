@@ -17,6 +17,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import STRING, cdr, read
+from test.shared import run_python
 
 # Writes messages that cannot be packed until something stops it, and says how many.
 RECORDER = """
@@ -51,14 +52,7 @@ except BagError as error:
 @pytest.mark.parametrize("limit", [1_000_000, 1_234_567, 3_000_000])
 def test_a_disk_that_takes_no_more(tmp_path: Path, limit: int):
     folder = tmp_path / "full"
-    done = subprocess.run(
-        [sys.executable, "-c", RECORDER, str(folder), str(limit)],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=300,
-    )
-    first, second = done.stdout.splitlines()
+    first, second = run_python("-c", RECORDER, folder, limit).splitlines()
     bag = Bag(folder)
     assert f"full: the disk takes no larger file after {bag.counts['/noise']} messages; what was recorded" in first
     assert first.endswith(str(folder / "full_0.mcap"))
@@ -82,9 +76,8 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
     bag = Bag(folder)
     assert bag.damage is not None
     assert "truncated" in str(bag.damage)
-    assert (
-        bag.counts["/noise"] >= said - 16
-    )  # a chunk holds seven or eight: one is filled, one is on its way to the disk
+    # A chunk holds seven or eight: one is filled, one is on its way to the disk.
+    assert bag.counts["/noise"] >= said - 16
     assert [each for _, each, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
 
 
@@ -140,7 +133,7 @@ def test_the_bytes_of_a_bag_do_not_depend_on_when_its_worker_runs(tmp_path: Path
 def test_a_bag_that_nobody_closes_lets_its_process_end(tmp_path: Path):
     program = "import sys; from magnetosuture_thread.bags.writer import BagWriter; from pathlib import Path; "
     program += "bag = BagWriter(Path(sys.argv[1])); bag.add_topic('/text', 'std_msgs/msg/String')"
-    subprocess.run([sys.executable, "-c", program, str(tmp_path / "bag")], check=True, timeout=60.0)
+    run_python("-c", program, tmp_path / "bag")
 
 
 @pytest.mark.parametrize(("received", "published"), [(-1, 0), (1, -1), (1, 1 << 64)])

@@ -10,11 +10,10 @@ import pytest
 
 from magnetosuture_thread import cli, replay_offline
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.settings.interface import NEEDLE_POSE, PREDICTED_THREAD
-from test.bags.bags import copy_with_notes
+from test.bags.bags import changed, copy_with_notes
 
 
 def broken(path: Path) -> Path:
@@ -58,17 +57,11 @@ def test_what_is_wrong_with_one_bag_is_in_its_row_and_ends_with_1(tmp_path: Path
 
 def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_bag: Path):
     replay_offline(short_bag, tmp_path / "replay")
-    both = tmp_path / "both"
-    with BagWriter(both, {"setup": "petri_35mm_polyamide"}) as writer:
-        for bag, names in (
-            (Bag(short_bag), {"/camera/image_raw/compressed", "/ground_truth/thread"}),
-            (Bag(tmp_path / "replay" / "bag"), {NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded}),
-        ):
-            for name in names:
-                writer.add_topic(name, bag.topics[name])
-            for record in bag.records(names):
-                late = 20_000_000 if name in (NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded) else 0
-                writer.write(record.topic, record.time + late, record.data)
+    replayed, said = Bag(tmp_path / "replay" / "bag"), {each.recorded: each for each in (NEEDLE_POSE, PREDICTED_THREAD)}
+    late = [(said[each.topic], each.time + 20_000_000, each.decode()) for each in replayed.records(set(said))]
+    seen = {"/camera/image_raw/compressed", "/ground_truth/thread"}
+    notes = {"setup": "petri_35mm_polyamide"}
+    both = changed(short_bag, tmp_path / "both", lambda old, it: it if old.topic in seen else None, late, notes)
     (row,) = evaluate_bags([both], tmp_path / "out")
     assert row["recorded_error_truth_frames"] == 28
     assert row["recorded_error_truth_mean_percent"] == pytest.approx(row["error_truth_mean_percent"], abs=1e-9)

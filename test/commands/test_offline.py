@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +13,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import replay_offline
-from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.packing import packed_compressed_image, packed_scene
+from magnetosuture_thread.bags.packing import packed_compressed_image
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
@@ -25,12 +22,13 @@ from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.recorded import BagInput, ObservationReader, Step, chosen_source, predictions
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.scene import Scene, SceneShape
+from magnetosuture_thread.geometry.scene import SceneShape
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
-from test.bags.bags import changed, make, stamped
+from test.bags.bags import changed, make, scene_message, stamped
+from test.shared import known, run_python
 from test.vision.scenes import rod
 
 SETUP = read_setup("petri_35mm_polyamide")
@@ -70,30 +68,6 @@ def restamped(bag: Path, folder: Path, stamp: Callable[[RecordedMessage, int], i
     return changed(bag, folder, change)
 
 
-def with_changes(bag: Path, folder: Path, *changes: tuple[float, Scene, str], material: str = "") -> Path:
-    """Write a bag again with scenes at times [s], each with its version or another, and a material at the last time."""
-    source = Bag(bag)
-    with BagWriter(folder, source.notes) as writer:
-        added = {SCENE.recorded: SCENE.type_name, interface.MATERIAL.recorded: interface.MATERIAL.type_name}
-        for topic, type_name in {**source.topics, **added}.items():
-            writer.add_topic(topic, type_name)
-        for record in source.records(set(source.topics)):
-            writer.write(record.topic, record.time, record.data)
-        for time, scene, version in changes:
-            stamp = round(time * 1e9)
-            message: Any = typestore().deserialize_cdr(packed_scene(stamp, scene), SCENE.type_name)
-            message.version = version or message.version
-            writer.write_message(SCENE.recorded, stamp, message)
-        if material:
-            numbers = dict.fromkeys(("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"), 0.0)
-            empty = {"rest_curvature": np.empty(0), "attachment": "", "attachment_offset": np.empty(0)}
-            time_of = make("builtin_interfaces/msg/Time", *divmod(stamp, 10**9))
-            header = make("std_msgs/msg/Header", time_of, "dish")
-            thread = make(interface.MATERIAL.type_name, header=header, name=material, **numbers, **empty)
-            writer.write_message(interface.MATERIAL.recorded, stamp, thread)
-    return folder
-
-
 def test_what_cannot_be_replayed_is_refused_and_nothing_is_left(pose_bag: Path, tmp_path: Path):
     (tmp_path / "empty.mcap").write_bytes(b"")
     blind = without(pose_bag, tmp_path / "blind", POSE, MEASURED, interface.NEEDLE_COMMAND.recorded)
@@ -130,12 +104,10 @@ def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path, topic: str):
 def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
     summary = replay_offline(pose_bag, tmp_path / "a")
     assert (summary.frames, summary.tracked, summary.predicted, summary.source) == (30, 30, 30, "poses")
-    assert summary.error_truth is not None
-    assert (summary.error_truth["count"], summary.error_truth["maximum"] < 1.0) == (30, True)
-    command = [sys.executable, "-m", "magnetosuture_thread.cli", "replay", "--offline", str(pose_bag), "--output", "b"]
-    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
-    assert shown.returncode == 0, shown.stderr
-    assert "times as fast as recorded" in shown.stdout
+    error = known(summary.error_truth)
+    assert (error["count"], error["maximum"] < 1.0) == (30, True)
+    command = ("-m", "magnetosuture_thread.cli", "replay", "--offline", pose_bag, "--output", "b")
+    assert "times as fast as recorded" in run_python(*command, cwd=tmp_path)
     for name in ("bag_0.mcap", "metadata.yaml"):
         assert (tmp_path / "a" / "bag" / name).read_bytes() == (tmp_path / "b" / "bag" / name).read_bytes()
     assert json.loads((tmp_path / "a" / "summary.json").read_text())["predicted"] == 30
@@ -158,8 +130,7 @@ def test_stamps_that_go_back_are_refused_and_a_time_that_goes_back_by_more_begin
     anew = restamped(pose_bag, tmp_path / "anew", lambda old, stamp: stamp + 3 * 10**9 * (stamp < 1.5e9))
     summary = replay_offline(anew, tmp_path / "out")
     assert summary.predicted == 30
-    assert summary.error_seen is not None
-    assert summary.error_seen["maximum"] < 1.0
+    assert known(summary.error_seen)["maximum"] < 1.0
 
 
 def test_a_recorded_point_at_the_tip_gives_a_needle_without_a_thread_its_direction(tmp_path: Path):
@@ -208,8 +179,12 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
     scene, too_fine = (
         SETUP.scene.add(SceneShape("post", "instrument", Disc((0.0, 0.006), radius))) for radius in (2e-3, 1e-5)
     )
-    changes = ((1.39, scene, ""), (1.5, scene, "f" * 16), (1.61, too_fine, ""))
-    bag = with_changes(pose_bag, tmp_path / "told", *changes, material="silk_6_0")
+    times = [round(time * 1e9) for time in (1.39, 1.5, 1.61)]
+    scenes = map(scene_message, times, (scene, scene, too_fine), ("", "f" * 16, ""))
+    header = make("std_msgs/msg/Header", make("builtin_interfaces/msg/Time", *divmod(times[-1], 10**9)), "dish")
+    told = [(SCENE, *each) for each in zip(times, scenes, strict=True)]
+    told.append((interface.MATERIAL, times[-1], make(interface.MATERIAL.type_name, header, name="silk_6_0")))
+    bag = changed(pose_bag, tmp_path / "told", added=told)
     for start, first in ((0.0, 12), (0.5, 0)):
         seen = observed(bag, start=start)
         steps = [event for event in predictions(seen, SETUP.model, SETUP.scene) if isinstance(event, Step)]
