@@ -16,8 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,12 +34,12 @@ from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 from magnetosuture_thread.settings.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 SETUP, SEGMENTS, FRAME_RATE = "petri_35mm_polyamide", 81, 30.0  # the latter in place of the setup's own
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 TIMEOUT = 240.0  # s for the graph to be there; the first start on a machine compiles
-GRACE = 60.0  # s for the command to end
+GRACE = 90.0  # s for the command to end
 KEYS = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"))  # by axis; the second where the tip is beyond 0
 STATIONS = {OPERATOR_COMMAND: "the page's command in the graph", NEEDLE_SETPOINT: "the filtered velocity at the bridge"}
 LISTEN = """() => { window.bench_keys = []; addEventListener('keydown', (event) => {
@@ -99,7 +99,9 @@ def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict
         server = stack.enter_context(running_console(str(path)))
         domain, url = int(server.find(r"ROS domain (\d+)")), server.find(r"open (http\S+)")
         server.find(r"(runs; the coils)")
-        page, sent = stack.enter_context(_page(url)), stack.enter_context(_sent(domain))
+        browser, sent = stack.enter_context(started_browser()), stack.enter_context(_sent(domain))
+        page = browser.new_page(viewport={"width": 1366, "height": 768})
+        page.goto(url)
         for button in ("#control", "#arm"):
             page.locator(f"{button}:enabled").click(timeout=1e3 * TIMEOUT)
         page.evaluate(LISTEN)
@@ -114,11 +116,12 @@ def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict
 
 
 @dataclass
-class RunningConsole:
-    """The command `magnetosuture console`, running; what it prints goes to a file."""
+class RunningCommand:
+    """The command `magnetosuture`, running; what it prints goes to files."""
 
     process: subprocess.Popen[bytes]
     output: Path
+    errors: Path
 
     def find(self, pattern: str) -> str:
         """Wait for a line, and return what the pattern's group holds.
@@ -131,11 +134,12 @@ class RunningConsole:
             if match := re.search(pattern, self.output.read_text(), re.MULTILINE):
                 return match[1]
             time.sleep(0.02)
-        raise GraphError(f"the console ended, or shows no {pattern} after {TIMEOUT:g} s: {self.output.read_text()}")
+        shown = self.output.read_text() + self.errors.read_text()
+        raise GraphError(f"the command ended, or shows no {pattern} after {TIMEOUT:g} s: {shown}")
 
-    def end(self) -> int:
-        """Press Ctrl-C; return the exit code."""
-        self.process.send_signal(signal.SIGINT)
+    def end(self, by: signal.Signals = signal.SIGINT) -> int:
+        """Press Ctrl-C, or send another signal; return the exit code."""
+        self.process.send_signal(by)
         try:
             return self.process.wait(GRACE)
         except subprocess.TimeoutExpired:
@@ -144,19 +148,35 @@ class RunningConsole:
 
 
 @contextmanager
-def running_console(*arguments: str, **environment: str) -> Iterator[RunningConsole]:
-    """Run the command on a free port; end it at the end if it has not."""
-    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
-    env = {**os.environ, **environment}
-    with TemporaryDirectory() as folder, Path(folder, "output").open("wb") as file:
-        # In a session of its own: Ctrl-C at a terminal is not for it.
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=env, start_new_session=True)
-        console = RunningConsole(process, Path(file.name))
+def running(
+    *arguments: object, cwd: Path | None = None, environment: Mapping[str, str] | None = None
+) -> Iterator[RunningCommand]:
+    """Run the command; end it at the end if it has not."""
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", *map(str, arguments)]
+    env = {**os.environ, **(environment or {})}
+    with TemporaryDirectory() as folder, ExitStack() as stack:
+        out, err = (stack.enter_context(Path(folder, name).open("wb")) for name in ("output", "errors"))
+        process = subprocess.Popen(
+            command,
+            stdout=out,
+            stderr=err,
+            cwd=cwd,
+            env=env,
+            start_new_session=True,  # Ctrl-C at a terminal is not for it
+            # What runs in a shell's background inherits an ignored SIGINT; a user's terminal does not.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        started = RunningCommand(process, Path(out.name), Path(err.name))
         try:
-            yield console
+            yield started
         finally:
-            if console.process.poll() is None:
-                console.end()
+            if process.poll() is None:
+                started.end()
+
+
+def running_console(*arguments: str, **environment: str) -> AbstractContextManager[RunningCommand]:
+    """Run `magnetosuture console` on a free port."""
+    return running("console", *arguments, "--port", "0", environment=environment)
 
 
 def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
@@ -176,8 +196,8 @@ def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
 
 
 @contextmanager
-def _page(url: str) -> Iterator[Page]:
-    """Open a page in a browser without a window."""
+def started_browser() -> Iterator[Browser]:
+    """Start a browser without a window."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
         raise ConfigurationError("browser", "none found", f"one of {', '.join(BROWSERS)}: apt install chromium")
@@ -189,9 +209,7 @@ def _page(url: str) -> Iterator[Page]:
     with sync_playwright() as playwright:
         started = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
         try:
-            page = started.new_page(viewport={"width": 1366, "height": 768})
-            page.goto(url)
-            yield page
+            yield started
         finally:
             started.close()
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.page import running
 from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.bags import calibrate_bags
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
@@ -106,18 +104,11 @@ def test_a_picture_that_fails_costs_no_fit(folder: Path, tmp_path: Path, monkeyp
 
 def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
     output = tmp_path / "best.yaml"
-    command = [sys.executable, "-m", "magnetosuture_thread.cli", "calibrate", str(folder / "one")]
-    command += ["--setup", str(folder / "lab.yaml"), "--output", str(output), "--workers", "1"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        for line in process.stdout:
-            if line.startswith("tried"):
-                process.send_signal(signal.SIGINT)
-                break
-        rest, errors = process.communicate(timeout=120)
-    assert (process.returncode, errors) == (130, "")
-    assert "interrupted; writing the best so far" in rest
+    options = ("--setup", folder / "lab.yaml", "--output", output, "--workers", "1")
+    with running("calibrate", folder / "one", *options) as command:
+        command.find("(^tried)")
+        assert (command.end(), command.errors.read_text()) == (130, "")
+        assert "interrupted; writing the best so far" in command.output.read_text()
     assert output.read_text().startswith("# BEST SO FAR, NOT FINISHED")
     assert stiffness_over_drag(read_setup(str(output)).model) == pytest.approx(TRUE, rel=0.2)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["best.png", "best.yaml"]

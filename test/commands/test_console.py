@@ -115,6 +115,7 @@ def test_a_person_steers_the_simulated_rig(tmp_path: Path):
             asyncio.run(use(url, currents))
         assert console.end() == 0
         assert console.output.read_text().endswith("ended\n")
+        assert console.errors.read_text() == ""
     first, second = map(Bag, sorted(recordings.iterdir()))  # ended by the choice of a setup, and by Ctrl-C
     assert first.damage is second.damage is None
     assert second.notes["setup"] == OTHER

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import re
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from std_srvs.srv import SetBool
 
+from benchmarks.page import running
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
@@ -35,6 +32,7 @@ from magnetosuture_thread.settings.interface import (
     Channel,
 )
 from test.nodes.conftest import Graph, own_context
+from test.shared import known
 
 pytestmark = pytest.mark.whole_graph
 
@@ -54,8 +52,7 @@ def test_a_bag_is_replayed_judged_and_recorded_as_offline(short_bag: Path, tmp_p
     assert (summary.frames, summary.tracked, summary.predicted) == (30, 28, 28)  # the first in the third frame
     assert summary.commands == 30
     assert summary.driven > 0  # all of them, unless the machine is so loaded that the watchdog bites
-    assert summary.error_truth is not None
-    assert summary.error_truth["maximum"] < 1.0
+    assert known(summary.error_truth)["maximum"] < 1.0
     assert {margin.kind for margin in summary.least_margins} == {"connectivity", "compression", "wall"}
     assert summary.residual < 1e-5
     assert all(spread is not None and spread.median > 0.0 for spread in summary.latency.values())
@@ -103,38 +100,13 @@ def content(output: Path) -> dict[tuple[Channel, int], bytes]:
     return found
 
 
-@contextmanager
-def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Give a process that is ended by Ctrl-C if the test fails: one that goes on disturbs all others."""
-    with subprocess.Popen(
-        command,
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # A test run in a shell's background inherits an ignored SIGINT; a user's terminal does not.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    ) as process:
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-                process.communicate(timeout=90)
-
-
 def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag: Path, tmp_path: Path):
-    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(pose_bag)]
-    with started([*command, "--output", "out", "--loop"], tmp_path) as process:
-        assert process.stdout is not None
-        lines = iter(process.stdout)
-        found = re.search(
-            r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) ", next(each for each in lines if "to pause" in each)
-        )
-        assert found is not None
-        with own_context(int(found[1])) as context, closing(Graph(context, int(found[1]))) as graph:
+    with running("replay", pose_bag, "--output", "out", "--loop", cwd=tmp_path) as command:
+        domain = int(command.find(r"to pause.*ROS_DOMAIN_ID=(\d+)"))
+        service = command.find(r"to pause.* ros2 service call (\S+) ")
+        with own_context(domain) as context, closing(Graph(context, domain)) as graph:
             clocks, predicted = graph.listen(topics.CLOCK), graph.listen(topics.PREDICTED_THREAD)
-            client = graph.probe.create_client(SetBool, found[2])
+            client = graph.probe.create_client(SetBool, service)
             graph.wait(lambda: client.service_is_ready() and bool(clocks), "the replay")
 
             def pause(still: bool) -> int:
@@ -152,13 +124,11 @@ def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag:
             assert nanoseconds(clocks[-1].clock) == stood
             pause(False)
             graph.wait(lambda: nanoseconds(clocks[-1].clock) > stood, "time to go on")
-            assert any("playing on until Ctrl-C" in line for line in lines)
+            command.find("(playing on until Ctrl-C)")
             assert not (tmp_path / "out").exists()
             graph.wait(went_back, "the second pass", 90.0)
-        process.send_signal(signal.SIGINT)
-        shown, errors = process.communicate(timeout=90)
-    assert (errors, process.returncode) == ("", 0)
-    assert "results: out" in shown
+        assert (command.end(), command.errors.read_text()) == (0, "")
+        assert "results: out" in command.output.read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["predicted"] == 60
     assert not (tmp_path / "out" / "logs" / "vision_tracker.log").exists()  # poses need no tracker
@@ -174,17 +144,13 @@ def test_a_bag_that_is_too_short_for_a_loop_is_refused_before_anything_is_writte
 
 def test_a_replay_that_is_terminated_ends_its_nodes_and_leaves_nothing(tmp_path: Path):
     example = Path(__file__).parents[2] / "examples" / "post_wrap"
-    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(example), "--output", "out"]
-    with started(command, tmp_path) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("playing"):
-                break
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    with running("replay", example, "--output", "out", cwd=tmp_path) as command:
+        command.find("(^playing)")
+        pid = command.process.pid
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         assert len(children) == 2  # tracker and model are in one
-        process.send_signal(signal.SIGTERM)
-        _, errors = process.communicate(timeout=90)
-    assert process.returncode == 1
+        assert command.end(signal.SIGTERM) == 1
+        errors = command.errors.read_text()
     assert "interrupted" in errors
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []

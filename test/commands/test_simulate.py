@@ -5,10 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import create_autospec
@@ -18,6 +14,7 @@ import numpy as np
 import pytest
 from std_srvs.srv import Trigger
 
+from benchmarks.page import running
 from magnetosuture_thread import replay_offline
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import parse_scene_message
@@ -36,6 +33,7 @@ from magnetosuture_thread.settings.interface import (
     TIP_SETPOINT,
     Service,
 )
+from test.shared import wait_until
 
 pytestmark = pytest.mark.whole_graph
 
@@ -225,20 +223,17 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path: Pa
 
 
 def test_an_interrupted_run_on_a_simulated_clock_keeps_what_was_recorded(scenario: Path, tmp_path: Path):
-    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "simulate", str(scenario)]
-    command += ["--output", str(tmp_path / "bag"), "--duration", "60", "--rate", "1.5"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        assert process.stdout is not None
-        next(line for line in process.stdout if "running at 1.5 times the speed" in line)
-        deadline = time.monotonic() + 60.0
-        # a second or more of the run
-        while sum(path.stat().st_size for path in tmp_path.glob(".bag*/*.mcap")) < 1_500_000:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        rest = process.stdout.read()
-    assert process.returncode == 1
-    assert f"what was recorded is in {tmp_path / 'bag'}" in " ".join(rest.split())
+    options = ("--output", tmp_path / "bag", "--duration", "60", "--rate", "1.5")
+    with running("simulate", scenario, *options) as command:
+        command.find("(running at 1.5 times the speed)")
+
+        def recorded() -> bool:  # a second or more of the run
+            return sum(path.stat().st_size for path in tmp_path.glob(".bag*/*.mcap")) >= 1_500_000
+
+        wait_until(recorded, "a recording", 60.0)
+        assert command.end() == 1
+        shown = command.output.read_text() + command.errors.read_text()
+    assert f"what was recorded is in {tmp_path / 'bag'}" in " ".join(shown.split())
     bag = Bag(tmp_path / "bag")
     assert bag.counts["/needle/measured_cp"] > 10
     assert bag.start < 1000e9  # on the simulation's own clock

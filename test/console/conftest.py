@@ -19,9 +19,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
-from playwright.sync_api import Browser, sync_playwright
+from playwright.sync_api import Browser
 
-from benchmarks.page import BROWSERS
+from benchmarks.page import BROWSERS, started_browser
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from test.console.scene import RecordingGraph, RecordingHost
@@ -143,13 +143,10 @@ def served() -> Iterator[ServedConsole]:
 @pytest.fixture(scope="module")  # its loop must be gone before other tests start theirs
 def browser() -> Iterator[Browser]:
     """Start Chromium without a window."""
-    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if path is None:
+    if not any(map(shutil.which, BROWSERS)):
         pytest.skip("no chromium is installed; CI installs one")
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+    with started_browser() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(scope="session")
