@@ -304,14 +304,6 @@ def _saturated(random: Random) -> Case:
     return replace(case, lighting=replace(case.lighting, gain=random.uniform(1.1, 1.6)))
 
 
-def _dark_field(random: Random) -> Case:
-    return replace(usual_case(random), finish=(dark_field,))
-
-
-def _blunt_rod(random: Random) -> Case:
-    return replace(usual_case(random), rod=True)
-
-
 def _distorted(told: bool, random: Random) -> Case:
     strength, case = random.uniform(-0.06, 0.06), usual_case(random)
     lens = lens_with(strength, case.size) if told else None
@@ -330,11 +322,6 @@ def _cut_dish(least: float, greatest: float, random: Random) -> Case | None:
     if at.min() > 25.0 and (at < np.array(moved.size) - 25.0).all():
         return moved
     return None
-
-
-def _length_off(share: float, random: Random) -> Case:
-    """Return the usual frame, and a length of the needle that is set wrong by a share."""
-    return replace(usual_case(random), length_error=share * random.choice((-1.0, 1.0)))
 
 
 def _suture_needle(random: Random) -> Case:
@@ -465,6 +452,11 @@ def _beside(random: Random) -> Case | None:
     return _with(case, other, {"distance": abs(side)}) if clear else None
 
 
+def _length_off(share: float, random: Random) -> Case:
+    """Return the usual frame, and a length of the needle that is set wrong by a share."""
+    return replace(usual_case(random), length_error=share * random.choice((-1.0, 1.0)))
+
+
 CLASSES: dict[str, MakeCase] = {
     "usual": usual_case,
     **{
@@ -481,8 +473,8 @@ CLASSES: dict[str, MakeCase] = {
     "second_needle": _second_needle,
     **{f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)},
     "saturated": _saturated,
-    "dark_field": _dark_field,
-    "blunt_rod": _blunt_rod,
+    "dark_field": lambda random: replace(usual_case(random), finish=(dark_field,)),
+    "blunt_rod": lambda random: replace(usual_case(random), rod=True),
     "distortion": partial(_distorted, True),
     "distortion_untold": partial(_distorted, False),
     "cut_dish": partial(_cut_dish, 0.1, 0.55),

@@ -15,12 +15,14 @@ from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.settings.shared_parameters import load_setup
 from magnetosuture_thread.vision.calibration import (
     CORNERS,
+    Calibration,
     calibrate_by_dish,
     calibrate_by_markers,
     measure_needle_length,
 )
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
+from test.shared import known
 from test.vision.scenes import SCENE, VIEW, Pose, render, rod
 
 SPACING, SIDE = 0.034, 0.005
@@ -42,6 +44,12 @@ def markers(view: DishView, ids: tuple[int, ...] = (0, 1, 2, 3), share: float = 
     return cv2.GaussianBlur(image, (0, 0), 0.7)
 
 
+def read_back(found: Calibration, folder: Path) -> VisionTrackerSettings:
+    """Write a calibration to a file and return the tracker's settings from it."""
+    (folder / "camera.yaml").write_text(found.to_yaml())
+    return load_setup(folder / "camera.yaml", (VisionTrackerSettings,))["vision_tracker"]
+
+
 def test_what_is_not_sure_of_a_calibration_is_said(tmp_path: Path):
     frames = [render(Pose(np.array([0.001 * index, 0.0]), 0.3)) for index in range(10)]
     moved = [np.roll(frame, 10, axis=1) if index > 5 else frame for index, frame in enumerate(frames)]
@@ -49,9 +57,7 @@ def test_what_is_not_sure_of_a_calibration_is_said(tmp_path: Path):
     assert found.view.metres_per_pixel == pytest.approx(8e-5, rel=5e-3)
     assert "4 of 10 frames show the dish elsewhere" in found.remark
     assert found.view.centre_px[0] == pytest.approx(322.0, abs=0.3)
-    (tmp_path / "camera.yaml").write_text(replace(found, scale_error=0.07).to_yaml())
-    settings = load_setup(tmp_path / "camera.yaml", (VisionTrackerSettings,))["vision_tracker"]
-    assert settings.scale_error == 0.07
+    assert read_back(replace(found, scale_error=0.07), tmp_path).scale_error == 0.07
 
 
 def test_dishes_that_differ_or_are_missing_are_refused():
@@ -112,9 +118,7 @@ def test_the_needles_length_is_measured_over_frames_and_written_for_every_node(s
     found = calibrate_by_dish(images, 0.035)
     length = measure_needle_length(images, found, share * 0.007, 0.0004)
     assert length == pytest.approx(0.007, rel=0.01)
-    file = tmp_path / "camera.yaml"
-    file.write_text(replace(found, needle=(length, 0.00041)).to_yaml())
-    settings = load_setup(file, (VisionTrackerSettings,))["vision_tracker"]
+    settings = read_back(replace(found, needle=(length, 0.00041)), tmp_path)
     assert (settings.needle_length, settings.needle_width) == pytest.approx((length, 0.00041), abs=1e-6)
     with pytest.raises(InvalidInputError, match="both ends of a needle of 9 mm"):
         measure_needle_length(images, found, 0.009, 0.0004)
@@ -132,11 +136,8 @@ def test_by_markers_a_tilted_camera_is_straightened_and_the_needle_is_where_it_i
 
     share = 2.0 / 3.0  # so that the markers are in the image
     found = calibrate_by_markers([taken(markers(VIEW, share=share))], 0.035, share * SPACING, share * SIDE)
-    file = tmp_path / "camera.yaml"
-    file.write_text(found.to_yaml())
-    settings = load_setup(file, (VisionTrackerSettings,))["vision_tracker"]
-    assert found.homography is not None
-    np.testing.assert_allclose(settings.homography(), found.homography, rtol=1e-9)
+    settings = read_back(found, tmp_path)
+    np.testing.assert_allclose(known(settings.homography()), known(found.homography), rtol=1e-9)
     pose = Pose(np.array([0.009, -0.006]), 0.8)
     seen = VisionTracker(settings, SCENE).look(taken(render(pose)))
     assert seen.state is State.TRACKED

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.scene import Dish, Scene
-from magnetosuture_thread.vision.tracker import State, VisionTracker
-from test.vision.test_rods import DIAMETER, Rod, is_along
+from magnetosuture_thread.vision.tracker import State
+from test.shared import known
+from test.vision.test_rods import Rod, is_along, tracker_of
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +38,7 @@ def test_the_axis_is_found_among_dimples_and_beside_a_bump_that_hides_a_part(ben
     found = 0
     for seed in SEEDS:
         image, ends, told = Rod(seed, share=0.03, bend=bend).drawn()
-        seen = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(dimpled(image, seed, ends))
+        seen = tracker_of(told).look(dimpled(image, seed, ends))
         assert seen.state is not State.TRACKED
         if len(seen.axis):
             found += 1
@@ -51,8 +50,7 @@ def test_the_axis_is_found_among_dimples_and_beside_a_bump_that_hides_a_part(ben
 def test_a_dish_without_a_needle_gives_nothing(what: str):
     for seed in SEEDS:
         image, ends, told = Rod(seed, share=0.03).drawn()
-        view = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(image).view
-        assert view is not None
+        view = known(tracker_of(told).look(image).view)
         # The rod is painted out.
         bare, width = np.median(image), told.needle_width / view.metres_per_pixel
         cover = np.zeros(image.shape, np.uint8)
@@ -76,5 +74,4 @@ def test_a_dish_without_a_needle_gives_nothing(what: str):
         else:
             empty = dimpled(empty, seed)
         for off in (0.95, 1.0, 1.05):
-            told_off = replace(told, needle_length=off * told.needle_length)
-            assert not len(VisionTracker(told_off, Scene(dish=Dish(DIAMETER))).look(empty).axis), seed
+            assert not len(tracker_of(told, needle_length=off * told.needle_length).look(empty).axis), seed

@@ -9,20 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.vision.photographs import DIAMETER, RIGHT, ellipse_error, photo_of
 from magnetosuture_thread.vision.dish import Ellipse, find_rings, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.shared import known
+from test.vision.photographs import DIAMETER, PHOTOGRAPHS, RIGHT, ellipse_error, photo_of
 from test.vision.scenes import Pose, render
 
 pytestmark = pytest.mark.slow
-
-CLASSES = (
-    "photo_on_cloth",
-    "photo_on_light_box",
-    "photo_on_wood",
-    "photo_blood",
-    "photo_tilted",
-)
 
 
 def drawn(ellipse: Ellipse, size: tuple[int, int], inside: int, outside: int) -> np.ndarray:
@@ -36,7 +29,7 @@ def drawn(ellipse: Ellipse, size: tuple[int, int], inside: int, outside: int) ->
     return cv2.GaussianBlur(np.round(outside + (inside - outside) * share).astype(np.uint8), (0, 0), 0.8)
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
 def test_most_dishes_in_photographs_are_found(name: str):
     right = 0
     for index in range(6):
@@ -51,8 +44,7 @@ def test_most_dishes_in_photographs_are_found(name: str):
 def test_a_given_scale_is_used_and_a_warning_says_by_how_much_the_dish_contradicts_it():
     frame = render(Pose(np.zeros(2), 0.3))
     for share, remark in ((1.02, ""), (1.07, "is 7% off the dish"), (0.94, "is 6% off the dish")):
-        found = see_dish(frame, VisionTrackerSettings(metres_per_pixel=share * 8e-5), 0.035)
-        assert found is not None
+        found = known(see_dish(frame, VisionTrackerSettings(metres_per_pixel=share * 8e-5), 0.035))
         assert re.search(remark, found.warning)
         assert bool(found.warning) == bool(remark)
         assert found.view.metres_per_pixel == pytest.approx(share * 8e-5, rel=1e-9)
@@ -68,8 +60,7 @@ def test_a_wall_of_two_edges_makes_the_doubt_of_the_scale_unless_the_user_names_
     for size in (1.0, 0.5):
         image = cv2.resize(frame, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
         for rim, radius, doubt in (("", 170.0, 14.0 / 170.0), ("inner", 170.0, 0.01), ("outer", 184.0, 0.01)):
-            found = see_dish(image, VisionTrackerSettings(rim=rim), 0.035)
-            assert found is not None
+            found = known(see_dish(image, VisionTrackerSettings(rim=rim), 0.035))
             if not rim:
                 assert abs(0.0175 / found.view.metres_per_pixel / size / radius - 1.0) < doubt + 0.01
                 assert "name the wall's edge by rim" in found.warning

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import UNDIRECTED, State, Track, VisionTracker
+from test.shared import known
 
 DIAMETER = 0.05  # m
 RATE = 30.0
@@ -76,9 +78,11 @@ class Rod:
 
 def is_along(seen: Track, ends: np.ndarray, share: float = 0.06) -> bool:
     """Say whether tail and tip lie at two ends (u, v), in this order, within 2 px and a share of their distance."""
-    assert seen.view is not None
-    apart = np.abs(seen.view.to_pixels(seen.axis) - ends).max()
+    apart = np.abs(known(seen.view).to_pixels(seen.axis) - ends).max()
     return bool(apart < 2.0 + share * math.dist(*ends))
+
+
+FOURTH = Rod(4)
 
 
 @pytest.mark.slow
@@ -88,7 +92,7 @@ def test_the_axis_is_found_and_a_point_near_the_tip_gives_its_direction(rounded:
     found = 0
     for seed in range(12):
         image, ends, told = Rod(seed, rounded, gleam, (0.012, 0.02, 0.04)[seed % 3]).drawn()
-        tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
+        tracker = tracker_of(told)
         seen = tracker.look(image)
         assert seen.state is not State.TRACKED
         if not len(seen.axis):
@@ -97,9 +101,8 @@ def test_the_axis_is_found_and_a_point_near_the_tip_gives_its_direction(rounded:
         assert seen.reason == UNDIRECTED
         assert seen.covariance[2, 2] > 1.0
         assert is_along(seen, ends) or is_along(seen, ends[::-1])
-        assert seen.view is not None
         for way in (ends, ends[::-1]):
-            tracker.point_at_tip(seen.view.to_dish(way[1]))
+            tracker.point_at_tip(known(seen.view).to_dish(way[1]))
             told_seen = tracker.look(image)
             assert told_seen.state is State.TRACKED
             assert is_along(told_seen, way)
@@ -108,13 +111,22 @@ def test_the_axis_is_found_and_a_point_near_the_tip_gives_its_direction(rounded:
     assert found >= least
 
 
-def rod_in_view() -> tuple[np.ndarray, np.ndarray, VisionTracker, DishView]:
+def tracker_of(told: VisionTrackerSettings, **changes: Any) -> VisionTracker:
+    """Return a tracker in the dish of the pictures."""
+    return VisionTracker(replace(told, **changes), Scene(dish=Dish(DIAMETER)))
+
+
+def rod_in_view(rod: Rod = FOURTH) -> tuple[np.ndarray, np.ndarray, VisionTracker, DishView]:
     """Return a picture of a rod, its ends (u, v) [px], a tracker that has looked at it, and its view."""
-    image, ends, told = Rod(4).drawn()
-    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(image).view
-    assert view is not None
-    return image, ends, tracker, view
+    image, ends, told = rod.drawn()
+    tracker = tracker_of(told)
+    return image, ends, tracker, known(tracker.look(image).view)
+
+
+def with_thread(seed: int) -> tuple[np.ndarray, np.ndarray, VisionTracker]:
+    """Return a picture of a rod, its ends, and a tracker that is told of a thread of 120 px."""
+    image, ends, _, view = rod_in_view(Rod(seed))
+    return image, ends, tracker_of(Rod(seed).drawn()[2], thread_length=120.0 * view.metres_per_pixel)
 
 
 def test_a_direction_is_carried_over_while_the_rod_turns_round_and_not_over_a_gap_in_which_it_could():
@@ -136,10 +148,7 @@ def test_a_direction_is_carried_over_while_the_rod_turns_round_and_not_over_a_ga
 @pytest.mark.parametrize("turned", [0.0, 2.2, 3.1])
 @pytest.mark.parametrize("seed", [4, 7])
 def test_what_turned_in_a_gap_is_never_tracked_by_the_order_of_its_ends(seed: int, turned: float):
-    image, ends, told = Rod(seed).drawn()
-    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(image).view
-    assert view is not None
+    _, ends, tracker, view = rod_in_view(Rod(seed))
     tracker.point_at_tip(view.to_dish(ends[1]))
     for index in range(5):
         seen = tracker.track(Rod(seed, turned=1e-5 * index).drawn()[0], index / RATE)
@@ -151,10 +160,7 @@ def test_what_turned_in_a_gap_is_never_tracked_by_the_order_of_its_ends(seed: in
 
 @pytest.mark.parametrize("bend", [-1.0, 1.0, 2.0, 3.2])
 def test_a_bent_rod_whose_tip_was_pointed_at_is_tracked_that_way(bend: float):
-    image, ends, told = Rod(4, bend=bend).drawn()
-    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
-    view = tracker.look(image).view
-    assert view is not None
+    _, ends, tracker, view = rod_in_view(Rod(4, bend=bend))
     tracker.point_at_tip(view.to_dish(ends[1]))
     for index in range(8):
         seen = tracker.track(Rod(4, bend=bend, turned=1e-5 * index).drawn()[0], index / RATE)
@@ -231,11 +237,7 @@ def test_a_point_tells_no_direction_once_the_needle_is_forgotten():
 
 @pytest.mark.parametrize("seed", [3, 5, 6])
 def test_a_line_that_leaves_one_end_tells_the_direction_only_if_it_is_the_whole_thread(seed: int):
-    image, ends, told = Rod(seed).drawn()
-    view = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(image).view
-    assert view is not None
-    thread = 120.0 * view.metres_per_pixel
-    tracker = VisionTracker(replace(told, thread_length=thread), Scene(dish=Dish(DIAMETER)))
+    image, ends, tracker = with_thread(seed)
     own = tracker.look(with_line(image, ends, 120.0))
     assert own.state is State.TRACKED
     assert is_along(own, ends)
@@ -246,10 +248,7 @@ def test_a_line_that_leaves_one_end_tells_the_direction_only_if_it_is_the_whole_
 
 
 def test_each_frame_that_confirms_a_direction_must_tell_it_itself():
-    image, ends, told = Rod(4).drawn()
-    view = VisionTracker(told, Scene(dish=Dish(DIAMETER))).look(image).view
-    assert view is not None
-    tracker = VisionTracker(replace(told, thread_length=120.0 * view.metres_per_pixel), Scene(dish=Dish(DIAMETER)))
+    image, ends, tracker = with_thread(4)
     threaded = with_line(image, ends, 120.0)
     reasons = [
         tracker.track(frame, index / RATE).reason for index, frame in enumerate([threaded, image, image, threaded])
@@ -271,9 +270,8 @@ def test_a_rod_of_which_a_bright_mark_hides_a_corner_has_no_direction_with_any_s
         mark = np.array([far, near + 2.0 * aside, near, corner - 0.35 * width * aside + 2.0 * ahead])
         cv2.fillPoly(image, [np.round(mark * 16.0).astype(np.int32)], float(np.median(image)), cv2.LINE_AA, 4)
         for off in (0.95, 1.05):
-            length, width_off = off * told.needle_length, (2.0 - off) * told.needle_width
-            off_size = replace(told, needle_length=length, needle_width=width_off)
-            seen = VisionTracker(off_size, Scene(dish=Dish(DIAMETER))).look(image)
+            size = {"needle_length": off * told.needle_length, "needle_width": (2.0 - off) * told.needle_width}
+            seen = tracker_of(told, **size).look(image)
             assert seen.state is not State.TRACKED
             found += len(seen.axis) > 0
     assert found >= 14

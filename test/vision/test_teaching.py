@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.scene import Dish, Scene
+from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.teaching import teach
 from magnetosuture_thread.vision.tracker import UNDIRECTED, VisionTracker
+from test.shared import known
 from test.vision.scenes import VIEW, Pose, render
-from test.vision.test_rods import DIAMETER, Rod, is_along
+from test.vision.test_rods import DIAMETER, Rod, is_along, tracker_of
 
 FLOOR = np.array([200.0, 205.0, 210.0])  # blue, green, red
 COPPER = np.array([60.0, 75.0, 165.0])  # as bright in red as a thing that is passed over
@@ -35,19 +35,12 @@ def copper_frame(seed: int, turned: float = 0.0) -> tuple[np.ndarray, np.ndarray
     return image, ends, size
 
 
-def view_of(image: np.ndarray, settings: VisionTrackerSettings) -> DishView:
-    """Return where the dish is in a frame."""
-    view = VisionTracker(settings, Scene(dish=Dish(DIAMETER))).look(image).view
-    assert view is not None
-    return view
-
-
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("off", [0.0, 0.125])
 def test_marks_that_are_off_teach_the_size_and_the_colours_of_a_needle(seed: int, off: float):
     image, ends, true = copper_frame(seed)
     random, usual = np.random.default_rng(seed), VisionTrackerSettings()
-    view = view_of(image, usual)
+    view = known(tracker_of(usual).look(image).view)
     angles = random.uniform(-np.pi, np.pi, 2)
     marks = ends + off * math.dist(*ends) * np.column_stack([np.cos(angles), np.sin(angles)])
     taught = teach(image, view, 0.5 * DIAMETER, marks, usual)
@@ -60,18 +53,14 @@ def test_marks_that_are_off_teach_the_size_and_the_colours_of_a_needle(seed: int
     assert all(score < 0.6 * scores[0] for score in scores[1:])
     for turned in (0.7, 2.1):
         other, other_ends, _ = copper_frame(seed, turned)
-        seen = VisionTracker(taught.settings, Scene(dish=Dish(DIAMETER))).look(other)
+        seen = tracker_of(taught.settings).look(other)
         assert seen.reason == UNDIRECTED
         assert is_along(seen, other_ends) or is_along(seen, other_ends[::-1])
         # With its size alone it is too bright in red.
-        assert not len(VisionTracker(true, Scene(dish=Dish(DIAMETER))).look(other).axis)
+        assert not len(tracker_of(true).look(other).axis)
     without = np.clip(FLOOR + random.normal(0.0, 2.5, image.shape), 0.0, 255.0).astype(np.uint8)
     inside = np.hypot(*(np.indices(image.shape[:2])[::-1] - np.array(view.centre_px)[:, None, None])) < 170.0
-    assert not len(
-        VisionTracker(taught.settings, Scene(dish=Dish(DIAMETER)))
-        .look(np.where(inside[..., None], without, image))
-        .axis
-    )
+    assert not len(tracker_of(taught.settings).look(np.where(inside[..., None], without, image)).axis)
 
 
 def test_a_pointed_needle_is_not_taught_to_be_blunt():

@@ -104,12 +104,11 @@ def _draw_dish(
     random: np.random.Generator,
     picture: NDArray[Any],
     camera: _Camera,
-    at: NDArray[np.float64],
     floor: str,
     height: float,
 ) -> None:
     """Draw a dish with its shadow, its floor, its wall, sometimes a lid, and the lamp's reflections."""
-    x, y = (values - place for values, place in zip(camera.plane(0.0), at, strict=True))
+    x, y = camera.plane(0.0)
     away, around = np.hypot(x, y), np.arctan2(y, x)
     picture *= 1.0 - random.uniform(0.1, 0.4) * _step(np.hypot(x - 0.06, y - 0.05), 1.08, 0.05)[..., None]
     colour, opacity = FLOORS[floor]
@@ -124,7 +123,7 @@ def _draw_dish(
     if random.random() < 0.5:
         rims += [(height + 0.06, 1.09, sign), (height + 0.06, 1.12, -sign)]
     for level, radius, side in rims:
-        x, y = (values - place for values, place in zip(camera.plane(level), at, strict=True))
+        x, y = camera.plane(level)
         lit = 0.6 + 0.4 * np.cos(np.arctan2(y, x) - random.uniform(-np.pi, np.pi))
         picture += (side * random.uniform(20.0, 80.0) * lit * _ring(np.hypot(x, y), radius))[..., None]
     for _ in range(int(random.integers(0, 4))):
@@ -138,8 +137,6 @@ def photograph(
     ground: str | None = None,
     floor: str | None = None,
     tilt: tuple[float, float] = (0.0, 12.0),
-    cut: float = 0.0,
-    dishes: int = 1,
 ) -> Photograph:
     """Draw a photograph.
 
@@ -148,29 +145,23 @@ def photograph(
         ground: what the dish stands on.
         floor: what is in it.
         tilt: least and greatest, of the camera [degrees].
-        cut: share of the dish's diameter that the frame cuts off.
-        dishes: how many there are.
     """
     ground = ground or str(random.choice(list(GROUNDS)))
     rows = int(random.choice((240, 480, 768, 1080)))
     size = (int(rows * random.choice((1.0, 1.333, 1.778))), rows)
     distance = random.uniform(5.0, 10.0)
-    radius_px = random.uniform(0.22, 0.46) * min(size) / (1.4 if dishes > 1 else 1.0)
+    radius_px = random.uniform(0.22, 0.46) * min(size)
     angle, about = math.radians(random.uniform(*tilt)), random.uniform(-np.pi, np.pi)
     turn = cv2.Rodrigues(angle * np.array([math.cos(about), math.sin(about), 0.0]))[0]
     middle = np.array(size) * 0.5
     middle += random.uniform(-0.9, 0.9, 2) * np.maximum(middle - 1.15 * radius_px, 0.0)
-    if cut:
-        middle[0] = (1.0 - 2.0 * cut) * radius_px
     camera = _Camera(size, radius_px * distance, distance, turn, (float(middle[0]), float(middle[1])))
     x, y = camera.plane(0.0)
     level, depth = GROUNDS[ground]
     shade = random.uniform(-18.0, 18.0) * x + random.uniform(-18.0, 18.0) * y
     picture = np.array(level, np.float32) + (depth * _texture(random, x, y) + 0.5 * shade)[..., None]
-    height, way = random.uniform(0.2, 0.4), random.uniform(-np.pi, np.pi)
-    for other in range(dishes):
-        at = 2.5 * min(other, 1) * np.array([math.cos(way + 1.3 * other), math.sin(way + 1.3 * other)])
-        _draw_dish(random, picture, camera, at, floor or str(random.choice(list(FLOORS))), height)
+    height = random.uniform(0.2, 0.4)
+    _draw_dish(random, picture, camera, floor or str(random.choice(list(FLOORS))), height)
     picture = cv2.GaussianBlur(picture, (0, 0), random.uniform(0.6, 1.2) * max(1.0, rows / 600.0))
     picture += random.standard_normal(picture.shape).astype(np.float32) * random.uniform(1.0, 4.0)
     data = cv2.imencode(".jpg", np.clip(picture, 0.0, 255.0).astype(np.uint8))[1]
@@ -183,12 +174,9 @@ def photograph(
 
 
 PHOTOGRAPHS: dict[str, Callable[[np.random.Generator], Photograph]] = {
-    "photo_any": photograph,
-    **{f"photo_on_{ground}": partial(photograph, ground=ground) for ground in GROUNDS},
-    **{f"photo_{floor}": partial(photograph, floor=floor) for floor in FLOORS},
+    **{f"photo_on_{ground}": partial(photograph, ground=ground) for ground in ("cloth", "light_box", "wood")},
+    "photo_blood": partial(photograph, floor="blood"),
     "photo_tilted": partial(photograph, tilt=(12.0, 28.0)),
-    "photo_cut": partial(photograph, cut=0.2),
-    "photo_several": partial(photograph, dishes=3),
 }
 
 
