@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,14 @@ def measure_friction() -> list[dict[str, float]]:
     ]
 
 
+def around_post(at: NDArray[np.floating[Any]], angle: float, lead: float = LEAD) -> Points:
+    """Return the points at arc lengths of a thread from the east around the post by an angle, then straight [m]."""
+    turned = math.pi / 2 + np.clip((at - lead) / RADIUS, 0.0, angle)
+    tail = np.clip(at - lead - angle * RADIUS, 0.0, None)
+    x = RADIUS * np.cos(turned) - tail * np.sin(turned) + np.clip(lead - at, 0.0, None)
+    return np.column_stack([x, RADIUS * np.sin(turned) + tail * np.cos(turned)])
+
+
 def capstan(friction: float, angle: float, free: int, stiffness: float = 0.0) -> tuple[ThreadPredictor, Points]:
     """Return a thread around a post: from the needle to the east, `angle` counter-clockwise, then straight.
 
@@ -46,12 +54,7 @@ def capstan(friction: float, angle: float, free: int, stiffness: float = 0.0) ->
     """
     segment = 2.0 * math.pi * RADIUS / PER_TURN
     segments = round((LEAD + angle * RADIUS) / segment) + free
-    at = segment * np.arange(segments + 1)
-    turned = math.pi / 2 + np.clip((at - LEAD) / RADIUS, 0.0, angle)
-    tail = np.clip(at - LEAD - angle * RADIUS, 0.0, None)
-    x = RADIUS * np.cos(turned) - tail * np.sin(turned) + np.clip(LEAD - at, 0.0, None)
-    nodes = np.column_stack([x, RADIUS * np.sin(turned) + tail * np.cos(turned)])
-    medium = Medium(2.0 * DRAG, DRAG)
+    nodes, medium = around_post(segment * np.arange(segments + 1), angle), Medium(2.0 * DRAG, DRAG)
     thread = Thread("capstan", segments * segment, segments, DIAMETER, stiffness, medium, Attachment.PINNED)
     predictor = ThreadPredictor(thread, Workspace((Disc((0.0, 0.0), POST),), 2e-3, friction=(friction,)))
     predictor.start_at(NeedlePose(0.0, nodes[0], EAST), nodes)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
+from test.rig.test_truth import loop_field
 
 DISTANCE, RADIUS, FIELD = 0.05, 0.025, 1.2e-3
 
@@ -18,16 +19,8 @@ def coils(*angles: float) -> LoopCoils:
 @pytest.mark.parametrize("point", [(0.01, 0.012), (-0.013, -0.009), (0.0, 0.016), (0.016, 1e-7)])
 def test_off_the_axis_it_is_the_sum_over_the_loop(point: tuple[float, float]):
     """Biot-Savart by the rectangle rule, which on a loop converges faster than any power."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
-    ring = np.column_stack([np.full(400, DISTANCE), RADIUS * np.cos(turn), RADIUS * np.sin(turn)])
-    flow = np.column_stack([np.zeros(400), -RADIUS * np.sin(turn), RADIUS * np.cos(turn)])
-
-    def summed(at: np.ndarray) -> np.ndarray:
-        apart = at - ring
-        return (np.cross(flow, apart) / np.linalg.norm(apart, axis=1)[:, None] ** 3).sum(axis=0)
-
-    scale = FIELD / summed(np.zeros(3))[0]
-    expected = scale * summed(np.array([*point, 0.0]))[:2]
+    found, middle = (loop_field(np.array(at), 0.0, DISTANCE, RADIUS, 1.0) for at in (point, (0.0, 0.0)))
+    expected = FIELD / middle[0] * found
     np.testing.assert_allclose(coils().per_current(np.array(point))[:, 0], expected, rtol=1e-5, atol=1e-9)
 
 

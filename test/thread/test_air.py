@@ -10,7 +10,7 @@ import pytest
 from scipy.special import j0
 
 from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState
-from test.thread.scenes import east, formulated, in_air, straight
+from test.thread.scenes import east, followed, formulated, in_air, straight
 
 G = 9.81
 
@@ -23,24 +23,16 @@ def test_a_hanging_chain_swings_with_its_period(segments: int, within: float):
     """
     length = 0.5
     thread = in_air(length, segments, (0.0, -G))
-    formulation = formulated(thread)
     at = np.linspace(0.0, 1.0, segments + 1)
     shape = np.column_stack([0.01 * length * j0(2.404826 * np.sqrt(1.0 - at)), -length * at])  # the slowest mode
-    shape[1:] = np.cumsum(
-        length / segments * np.diff(shape, axis=0) / np.linalg.norm(np.diff(shape, axis=0), axis=1)[:, None], axis=0
-    )
-    state, dt = ThreadState.at_rest(shape), 5e-4
-    hung = PrescribedMotion((0,), np.zeros((1, 2)), east())
-    ends, times = [], []
-    for step in range(1, 4000):
-        state = formulation.step(state, hung, dt).state
-        ends.append(state.positions[-1, 0])
-        times.append(step * dt)
-    values = np.array(ends)
+    links = np.diff(shape, axis=0)
+    shape[1:] = np.cumsum(length / segments * links / np.linalg.norm(links, axis=1)[:, None], axis=0)
+    dt = 5e-4
+    steps = followed(formulated(thread), shape, lambda _: np.zeros(2), 3999, dt)
+    values = np.array([done.state.positions[-1, 0] for done in steps])
     rising = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
-    assert len(rising) >= 1
     falling = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
-    half = times[rising[0]] - times[falling[0]]
+    half = dt * (rising[0] - falling[0])
     assert 2.0 * half == pytest.approx(4.0 * math.pi / 2.404826 * math.sqrt(length / G), rel=within)
 
 

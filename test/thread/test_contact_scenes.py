@@ -23,7 +23,9 @@ from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
 from magnetosuture_thread.thread.rod import RodFormulation
+from test.shared import known
 from test.thread.scenes import DT, east, followed, formulated, polyamide, straight
+from test.thread.worlds import scene_with
 
 RATE = 60.0
 DEPTH = 1.01e-7  # m; the tolerance to which a step ends
@@ -92,14 +94,13 @@ def test_more_contacts_than_there_is_room_for_are_refused_and_the_thread_stays_w
     with pytest.raises(SolverError, match=f"more than {CONTACTS_PER_NODE * (thread.segments + 1)} contacts at once"):
         predictor.step(moved)
     assert predictor.pose is start
-    assert predictor.state is not None
-    np.testing.assert_array_equal(predictor.state.positions, before.positions)
+    np.testing.assert_array_equal(known(predictor.state).positions, before.positions)
 
     few = ThreadPredictor(thread, Workspace(CROWD[:10], 1e-3))
     few.start(start)
     assert few.step(moved).converged
 
-    scene = Scene(Dish(0.5), tuple(SceneShape(f"shape_{k}", "tissue", disc) for k, disc in enumerate(CROWD)))
+    scene = scene_with(*CROWD)
     forecaster = ThreadForecaster(thread, scene)
     found = forecaster.forecast(forecaster.straight(start), 1e-3 * EAST, 0.1)
     assert "contacts at once" in found.problem

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.geometry.scene import Scene
 
 
 def scene_with(*geometries: Disc | Polygon, diameter: float = 0.5) -> Scene:
     """Return a scene of some shapes, in a dish so wide that its wall is far unless a diameter is given [m]."""
-    shapes = tuple(SceneShape(f"shape_{index}", "tissue", shape) for index, shape in enumerate(geometries))
-    return Scene(Dish(diameter), shapes)
+    return Scene.create(dish_diameter=diameter, shapes={f"shape_{n}": shape for n, shape in enumerate(geometries)})
 
 
 def polygon(*corners: float) -> Polygon:

@@ -14,18 +14,11 @@ from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.rig.dynamics import NeedleBody, NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
+from test.thread.test_self_contact import loop_behind
 
 RATE, DIAMETER, EAST = 60.0, 60e-6, np.array([1.0, 0.0])
 LENGTH, SEGMENTS = 0.0195, 60
 SOFT = ThreadProperties(LENGTH, SEGMENTS, 2e-12, 5.65, 1.0, 0.5, NeedleJoint.PINNED, diameter=DIAMETER)
-
-
-def loop_behind(gap: float) -> np.ndarray:
-    """Return a thread that goes round a circle and ends beside its beginning, a gap outside of the circle [m]."""
-    radius = LENGTH / (2.0 * math.pi + 1.5)
-    turn = np.linspace(0.0, LENGTH / radius, 400)
-    away = radius + gap * np.clip(turn - 2.0 * math.pi + 0.5, 0.0, 1.0)
-    return np.column_stack([-away * np.sin(turn), away * np.cos(turn) - radius])
 
 
 def rig_of(nodes: np.ndarray, surface: Surface) -> RigDynamics:
@@ -45,7 +38,7 @@ def pull_out(rig: RigDynamics, nodes: np.ndarray) -> list[np.ndarray]:
 @pytest.mark.slow
 def test_the_model_predicts_the_rigs_loop():
     """Both keep strands a diameter apart, by code of their own."""
-    nodes = loop_behind(1.2e-3)
+    nodes = loop_behind(LENGTH, 1.2e-3)
     shapes = pull_out(rig_of(nodes, Surface(self_contact=True)), nodes)
     thread = Thread("soft", LENGTH, SEGMENTS, DIAMETER, 2e-12, Medium(1.0, 0.5), Attachment.PINNED)
     predictor = ThreadPredictor(thread, Scene(Dish(self_contact=True)))
