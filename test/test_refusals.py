@@ -14,31 +14,21 @@ import magnetosuture_thread
 from magnetosuture_thread import (
     MATERIALS,
     Attachment,
-    Barrier,
     ConfigurationError,
     Disc,
-    Dish,
     EstimatorOptions,
-    EstimatorSession,
     ForecastStart,
-    Gradient,
     InvalidInputError,
     MagnetosutureError,
-    Material,
     Medium,
     NeedlePose,
     NeedleSafetyFilter,
-    PaperOptions,
-    Polygon,
     Scene,
-    SceneShape,
     Thread,
-    ThreadEstimator,
     ThreadForecaster,
     ThreadPredictor,
-    Workspace,
-    check_gradient,
 )
+from test.coils.safety.test_user_barriers import HalfPlane
 
 SCENE = Scene.create(dish_diameter=0.045, shapes={"post": Disc((-0.01, 0.0), 0.0015)})
 EMPTY = Scene.create(dish_diameter=0.045)
@@ -46,23 +36,6 @@ EAST, STRAIGHT = np.array([1.0, 0.0]), np.array([[0.0, 0.0], [-0.019, 0.0]])
 THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
 POSE = NeedlePose(0.0, np.zeros(2), EAST)
 NODES = np.column_stack([np.linspace(0.0, -0.019, 26), np.zeros(26)])
-
-
-class Below(Barrier):
-    """h_i = 1 cm - y_i."""
-
-    name = "below"
-
-    def __init__(self, gain: Any = math.inf, slack_weight: Any = math.inf) -> None:
-        self.gain, self.slack_weight = gain, slack_weight
-
-    def value(self, positions: np.ndarray) -> np.ndarray:
-        """Return a row for each node."""
-        return np.asarray(0.01 - positions[:, 1])
-
-    def gradient(self, positions: np.ndarray) -> Gradient:
-        """Return its gradient."""
-        return Gradient(np.arange(len(positions))[:, None], np.tile([[[0.0, -1.0]]], (len(positions), 1, 1)))
 
 
 def made(kind: Callable[..., Any], /, **arguments: Any) -> Callable[..., Any]:
@@ -73,9 +46,6 @@ def made(kind: Callable[..., Any], /, **arguments: Any) -> Callable[..., Any]:
 CREATE = made(ThreadPredictor.create, material="polyamide_7_0", length=0.019, segments=25)
 FILTER = made(NeedleSafetyFilter, scene=EMPTY, needle_length=0.004)
 FORECASTER = made(ThreadForecaster, thread=THREAD, scene=EMPTY)
-MATERIAL = made(Material, name="x", diameter=6e-5, elastic_modulus=2e9, source="")
-MEDIUM = made(Medium, drag_across=1.0, drag_along=0.5)
-THREADS = made(Thread, **{name: getattr(THREAD, name) for name in Thread.__dataclass_fields__})
 
 
 def of_call(**changes: Any) -> Any:
@@ -103,7 +73,9 @@ def of_forecast(**changes: Any) -> Any:
 
 def of_barrier(**changes: Any) -> Any:
     """Give a barrier to a filter."""
-    return NeedleSafetyFilter(EMPTY, [Below(**changes)])
+    barrier = HalfPlane(0.01)
+    vars(barrier).update(changes)
+    return NeedleSafetyFilter(EMPTY, [barrier])
 
 
 TABLE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
@@ -135,30 +107,33 @@ def test_a_centreline_that_ends_early_is_continued_where_that_is_asked_for_and_o
 RECORDS = {"BarrierMargins", "FilteredCommand", "Forecast", "Gradient", "Margins", "Prediction", "ThreadEstimate"}
 OTHERS = {"MATERIALS", "Attachment", "ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"}
 OF_FILES = {"calibrate_bags", "read_scene", "replay_offline"}  # test/jobs, test/scene
-MADE: dict[str, tuple[Callable[..., Any], str]] = {
+MADE: dict[str, tuple[Callable[..., Any] | dict[str, Any], str]] = {  # what is called, or with what that name is called
     "Barrier": (of_barrier, "gain slack_weight"),
-    "Disc": (made(Disc, centre=(0.0, 0.0), radius=0.001), "centre radius"),
-    "Dish": (made(Dish), "diameter depth wall_friction self_contact"),
-    "EstimatorOptions": (made(EstimatorOptions), " ".join(EstimatorOptions.__dataclass_fields__)),
-    "EstimatorSession": (made(EstimatorSession, estimator=3), "estimator"),
-    "ForecastStart": (
-        of_forecast,
-        "pose vertices velocities interval tip_velocity needle_force",
+    "Disc": ({"centre": (0.0, 0.0), "radius": 0.001}, "centre radius"),
+    "Dish": ({}, "diameter depth wall_friction self_contact"),
+    "EstimatorOptions": ({}, " ".join(EstimatorOptions.__dataclass_fields__)),
+    "EstimatorSession": ({"estimator": 3}, "estimator"),
+    "ForecastStart": (of_forecast, "pose vertices velocities interval tip_velocity needle_force"),
+    "Material": (
+        {"name": "x", "diameter": 6e-5, "elastic_modulus": 2e9, "source": ""},
+        "diameter elastic_modulus stiffness_weight",
     ),
-    "Material": (MATERIAL, "diameter elastic_modulus stiffness_weight"),
-    "Medium": (MEDIUM, " ".join(Medium.__dataclass_fields__)),
+    "Medium": ({"drag_across": 1.0, "drag_along": 0.5}, " ".join(Medium.__dataclass_fields__)),
     "NeedlePose": (of_step, "stamp tail heading deviation"),
     "NeedleSafetyFilter": (
         FILTER,
         "scene barriers keep_out approach_rate hold_time max_speed max_acceleration needle_length "
         "needle_curvature",
     ),
-    "PaperOptions": (made(PaperOptions), "damping gain stiffness_gain connectivity_weight stiffness_weight lead_ahead"),
-    "Polygon": (made(Polygon, outline=((0, 0), (1, 0), (0, 1))), "outline holes"),
-    "Scene": (made(Scene), "dish shapes"),
-    "SceneShape": (made(SceneShape, name="a", kind="wall", geometry=Disc((0, 0), 1e-3)), "geometry friction"),
-    "Thread": (THREADS, "length segments diameter bending_stiffness medium attachment rest_curvature"),
-    "ThreadEstimator": (made(ThreadEstimator, predictor=3), "predictor options"),
+    "PaperOptions": ({}, "damping gain stiffness_gain connectivity_weight stiffness_weight lead_ahead"),
+    "Polygon": ({"outline": ((0, 0), (1, 0), (0, 1))}, "outline holes"),
+    "Scene": ({}, "dish shapes"),
+    "SceneShape": ({"name": "a", "kind": "wall", "geometry": Disc((0, 0), 1e-3)}, "geometry friction"),
+    "Thread": (
+        {name: getattr(THREAD, name) for name in Thread.__dataclass_fields__},
+        "length segments diameter bending_stiffness medium attachment rest_curvature",
+    ),
+    "ThreadEstimator": ({"predictor": 3}, "predictor options"),
     "ThreadForecaster": (
         FORECASTER,
         "thread scene safety law friction_averaging attachment_offset step margin_range "
@@ -170,10 +145,10 @@ MADE: dict[str, tuple[Callable[..., Any], str]] = {
         "margin_range contact_tolerance residual_tolerance max_step max_substeps fixed_nodes",
     ),
     "Workspace": (
-        made(Workspace, shapes=(Disc((0, 0), 1e-3),), reach=0.01),
+        {"shapes": (Disc((0, 0), 1e-3),), "reach": 0.01},
         "shapes reach dimension wall_radius friction wall_friction",
     ),
-    "check_gradient": (made(check_gradient, barrier=Below(), positions=STRAIGHT), "positions"),
+    "check_gradient": ({"barrier": HalfPlane(0.01), "positions": STRAIGHT}, "positions"),
     "NeedleSafetyFilter.filter": (
         of_call,
         "commanded tail heading slowdown max_speed previous elapsed time first_time",
@@ -186,7 +161,8 @@ WRONG = [-1.0, -1e-3, math.nan, math.inf, -math.inf, 0, [], [1.0, 2.0, 3.0], [[0
 
 @pytest.mark.parametrize("name", MADE)
 def test_whatever_a_public_constructor_is_given_it_says_what_is_wrong(name: str):
-    make, arguments = MADE[name]
+    given, arguments = MADE[name]
+    make = given if callable(given) else made(getattr(magnetosuture_thread, name), **given)
     for argument in arguments.split():
         refused = []
         for value in WRONG:

@@ -70,11 +70,16 @@ def outside(summary: dict[str, Any], truth: dict[str, float]) -> list[str]:
     return missed
 
 
+def commission(rig: str, folder: Path, *options: str) -> int:
+    """Run the command with poses that are drawn."""
+    return main(["commission", SETUP, "--rig", rig, "--drawn-poses", "--output", str(folder), *options])
+
+
 @pytest.fixture(scope="module")
 def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a commissioning: a short needle, a coil reversed, cables exchanged, a camera turned."""
     folder = tmp_path_factory.mktemp("commissioned") / "rig"
-    assert main(["commission", SETUP, "--rig", "random:1", "--drawn-poses", "--output", str(folder)]) == 0
+    assert commission("random:1", folder) == 0
     return folder
 
 
@@ -129,7 +134,7 @@ def test_the_same_pulses_give_the_same_again(commissioned: Path, tmp_path: Path,
     before = json.loads((commissioned / "summary.json").read_text())
     (commissioned / "summary.json").rename(tmp_path / "summary.json")
     try:
-        assert main(["commission", SETUP, "--rig", "random:1", "--drawn-poses", "--output", str(commissioned)]) == 0
+        assert commission("random:1", commissioned) == 0
         after = json.loads((commissioned / "summary.json").read_text())
     finally:
         (tmp_path / "summary.json").rename(commissioned / "summary.json")
@@ -138,8 +143,8 @@ def test_the_same_pulses_give_the_same_again(commissioned: Path, tmp_path: Path,
         assert after[key] == before[key]
     for one, other in zip(after["values"], before["values"], strict=True):
         assert one["value"] == pytest.approx(other["value"], rel=1e-6, abs=1e-12)
-    assert main(["commission", SETUP, "--rig", "random:1", "--drawn-poses", "--output", str(commissioned)]) == 1
-    assert main(["commission", SETUP, "--rig", "random:2", "--drawn-poses", "--output", str(commissioned)]) == 1
+    assert commission("random:1", commissioned) == 1
+    assert commission("random:2", commissioned) == 1
 
 
 def check(setup: Setup, believed: Setup, commissioned: Path) -> list[str]:
@@ -170,10 +175,9 @@ def test_a_check_tells_whether_the_rig_is_still_the_one(what: str, commissioned:
 
 
 def test_the_command_checks_the_rig(commissioned: Path, capsys: pytest.CaptureFixture[str]):
-    common = ["commission", SETUP, "--check", "--drawn-poses", "--output", str(commissioned)]
-    assert main([*common, "--rig", "random:1"]) == 0
+    assert commission("random:1", commissioned, "--check") == 0
     assert "the rig is still the one that was measured" in capsys.readouterr().out
-    assert main([*common, "--rig", "random:2"]) == 1
+    assert commission("random:2", commissioned, "--check") == 1
     assert main(["commission", SETUP, "--check", "--drawn-poses", "--output", str(commissioned / "nowhere")]) == 2
 
 

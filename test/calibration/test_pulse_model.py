@@ -19,6 +19,7 @@ from magnetosuture_thread.rig.truth import NO_THREAD
 LENGTH, NEEDLE = 6e-3, NeedleBody(6e-3, 4e-4, 0.0, 8e5, 0.7)
 ANGLES = np.array([0.2, 1.5, 3.3, -1.6])
 TIMES = np.arange(0.0, 0.8, 0.02)
+DEVIATIONS = np.array([5e-6, 5e-6, 2e-3])  # m, m, rad; of measured poses
 
 
 def parameters(**changes: object) -> RigParameters:
@@ -107,10 +108,9 @@ def test_a_coil_that_was_believed_on_the_other_side_by_a_needle_against_its_fiel
             pulses.append(replace(given, poses=poses))
     rough = parameters(drag=tuple(1.5 * drag for drag in NEEDLE.drag), residual=np.zeros(2), delay=0.0)
     wrong = replace(rough, angles=ANGLES + 0.1 + math.pi * np.array(turned))
-    deviations = np.array([5e-6, 5e-6, 2e-3])
-    apart = np.abs(np.exp(1j * on_their_sides(wrong, pulses, deviations).angles) - np.exp(1j * ANGLES))
+    apart = np.abs(np.exp(1j * on_their_sides(wrong, pulses, DEVIATIONS).angles) - np.exp(1j * ANGLES))
     assert apart.max() < 0.11
-    np.testing.assert_array_equal(on_their_sides(rough, pulses, deviations).angles, rough.angles)
+    np.testing.assert_array_equal(on_their_sides(rough, pulses, DEVIATIONS).angles, rough.angles)
 
 
 def test_a_fit_ends_as_soon_as_something_interrupts_it():
@@ -123,23 +123,22 @@ def test_a_fit_ends_as_soon_as_something_interrupts_it():
 
     given = pulse([0.5, 0.0, 0.0, 0.0])
     pulses = [replace(given, poses=truth.poses(given, np.array([-0.003, 0.0, angle]))) for angle in (0.4, 1.2)]
-    deviations = np.array([5e-6, 5e-6, 2e-3])
     with pytest.raises(KeyboardInterrupt):
-        PulseModel(truth, deviations, check).fit(pulses)
+        PulseModel(truth, DEVIATIONS, check).fit(pulses)
     called.clear()
     with pytest.raises(KeyboardInterrupt):
-        on_their_sides(truth, pulses, deviations, check)
+        on_their_sides(truth, pulses, DEVIATIONS, check)
     assert len(called) == 3
 
 
 @pytest.mark.slow
 def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
     truth, random = parameters(), np.random.default_rng(5)
-    deviations, pulses, pose = np.array([5e-6, 5e-6, 2e-3]), [], np.array([-0.003, 0.0, 0.4])
+    pulses, pose = [], np.array([-0.003, 0.0, 0.4])
     for _ in range(40):
         given = pulse((random.standard_normal(4) * (random.random(4) < 0.7) * 0.5).tolist(), random.uniform(0.1, 0.5))
         exact = truth.poses(given, pose)
-        pulses.append(replace(given, poses=exact + deviations * random.standard_normal(exact.shape)))
+        pulses.append(replace(given, poses=exact + DEVIATIONS * random.standard_normal(exact.shape)))
         pose = np.array([*(random.uniform(-3e-3, 3e-3, 2) - [0.003, 0.0]), exact[-1, 2]])
     drags = tuple(factor * drag for factor, drag in zip((1.4, 0.8, 1.3), NEEDLE.drag, strict=True))
     guess = parameters(
@@ -151,7 +150,7 @@ def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
     )
     # The mean of the fields is held.
     guess = replace(guess, fields=guess.fields * np.exp(np.log(np.abs(truth.fields / guess.fields)).mean()))
-    model = PulseModel(guess, deviations)
+    model = PulseModel(guess, DEVIATIONS)
     model.fit(pulses)
     found = model.parameters
     assert model.chi_square == pytest.approx(1.0, abs=0.1)

@@ -86,25 +86,20 @@ class Graph:
         self.wait(lambda: all(s.get_publisher_count() > 0 for s in others), f"{topic.name} to be found")
         publisher.publish(message)
 
-    def call(self, kind: Any, name: str, timeout: float = 30.0, /, **fields: Any) -> Any:
-        """Call a service and return its answer."""
+    def call(self, kind: Any, name: str, timeout: float = 30.0, /, *, held: float = 0.0, **fields: Any) -> Any:
+        """Call a service, while no callback runs for a time [s], and return its answer."""
         client = self.probe.create_client(kind, name)
         self.wait(client.service_is_ready, f"the service {name}")
-        future = client.call_async(kind.Request(**fields))
+        with self.between_callbacks():
+            future = client.call_async(kind.Request(**fields))
+            time.sleep(held)
         self.wait(future.done, f"an answer of {name}", timeout)
         self.probe.destroy_client(client)
         return future.result()
 
     def call_late(self, kind: Any, name: str, **fields: Any) -> Any:
-        """Call a service while no callback runs, for longer than what a person has pressed counts."""
-        client = self.probe.create_client(kind, name)
-        self.wait(client.service_is_ready, f"the service {name}")
-        with self.between_callbacks():
-            future = client.call_async(kind.Request(**fields))
-            time.sleep(PRESS_TIMEOUT + 0.1)
-        self.wait(future.done, f"an answer of {name}")
-        self.probe.destroy_client(client)
-        return future.result()
+        """Call a service so that it is answered later than what a person has pressed counts."""
+        return self.call(kind, name, held=PRESS_TIMEOUT + 0.1, **fields)
 
     def change(self, node: str, *transitions: int) -> bool:
         """Make transitions of a node, as `ros2 lifecycle set` does; return whether all succeeded."""

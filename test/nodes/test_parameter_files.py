@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,19 @@ def domain() -> Iterator[int]:
         yield reserved
 
 
+@contextmanager
+def follower(files: Sequence[Path], arguments: Sequence[str]) -> Iterator[PathFollowerNode]:
+    """Give a follower with parameter files and arguments."""
+    context, given = Context(), [part for file in files for part in ("--params-file", str(file))]
+    try:
+        init(["program", "--ros-args", *given, *arguments], context)
+        node = PathFollowerNode(context=context)
+        yield node
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
+
+
 @pytest.fixture
 def followed(tmp_path: Path, domain: int):
     """Makes a follower of the texts of files and of arguments; returns its name, speed and needle length."""
@@ -35,17 +49,9 @@ def followed(tmp_path: Path, domain: int):
         files = [tmp_path / f"{index}.yaml" for index in range(len(texts))]
         for file, text in zip(files, texts, strict=True):
             file.write_text(text)
-        given = [part for file in files for part in ("--params-file", str(file))]
-        context, node = Context(), None
-        try:
-            init(["program", "--ros-args", *given, *arguments], context)
-            node = PathFollowerNode(context=context)
+        with follower(files, arguments) as node:
             speed, length = (float(node.get_parameter(name).value) for name in ("speed", "needle_length"))
             return node.get_fully_qualified_name(), speed, length
-        finally:
-            if node is not None:
-                node.destroy_node()
-            context.try_shutdown()
 
     return make
 
@@ -101,17 +107,10 @@ def test_a_node_knows_the_settings_of_another_by_the_same_files(tmp_path: Path, 
     for text, moment in ((COMMON + bridge + own, 5e-4), (COMMON + own, CoilBridgeSettings().needle_moment)):
         file = tmp_path / "setup.yaml"
         file.write_text(text)
-        context, node = Context(), None
-        try:
-            init(["program", "--ros-args", "--params-file", str(file), *LAB1], context)
-            node = PathFollowerNode(context=context)
-            found = settings_of(node, CoilBridgeSettings, {"context": context})
+        with follower([file], LAB1) as node:
+            found = settings_of(node, CoilBridgeSettings, {"context": node.context})
             assert (found.needle_length, found.needle_moment) == (0.006, moment)
             assert found.pose_timeout == CoilBridgeSettings().pose_timeout
-        finally:
-            if node is not None:
-                node.destroy_node()
-            context.try_shutdown()
 
 
 def test_a_model_in_one_process_with_the_tracker_hears_the_topic_that_it_is_remapped_to(domain: int):

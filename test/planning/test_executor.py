@@ -30,6 +30,9 @@ NEEDLE = NeedleKinematics(0.0025)
 RATE = 20.0
 POST = SceneShape("post", "instrument", Disc((0.003, 0.0), 0.002))
 KNOWN = ThreadCondition()
+UNMEASURED = ThreadCondition(problem="the thread has not been measured for 1.0 s")
+UNHELD = ThreadCondition(problem="nobody holds the page", may_hold=False)
+AWAY: dict[str, Any] = {"go_to": {"position": [-0.012, 0.0]}}
 
 
 def executor(
@@ -81,6 +84,20 @@ class Needle:
         return self.tail + 0.5 * NEEDLE.chord * self.heading
 
 
+def begun(*goals: dict[str, Any], **options: Any) -> tuple[ProcedureExecutor, Needle]:
+    """Return a procedure that has been started, and its needle."""
+    run = executor(*goals, **options)
+    run.start()
+    return run, Needle()
+
+
+def give_up(run: ProcedureExecutor, needle: Needle, reason: str) -> None:
+    """Follow a procedure until it fails for a reason."""
+    needle.run(run, 60.0)
+    assert run.state is ProcedureState.FAILED
+    assert reason in run.reason
+
+
 @pytest.mark.parametrize("drift", [(0.0, 0.0), (1e-4, 3e-4), (-3e-4, 0.0)])
 def test_an_ideal_needle_reaches_every_goal(drift: tuple[float, float]):
     goals: list[dict[str, Any]] = [
@@ -88,9 +105,8 @@ def test_an_ideal_needle_reaches_every_goal(drift: tuple[float, float]):
         {"go_to": {"position": [-0.008, 0.004], "heading": [2.5]}},
         {"withdraw": {}},
     ]
-    run, needle = executor(*goals), Needle()
+    run, needle = begun(*goals)
     needle.drift = np.array(drift)
-    run.start()
     needle.run(run, 200.0)
     assert (run.state, run.reason, run.goal) == (ProcedureState.DONE, "", 2)
     assert math.dist(needle.middle, (-0.006 + 0.5 * NEEDLE.chord, 0.0)) < 1e-3
@@ -120,7 +136,7 @@ def test_a_path_planned_before_the_start_is_taken_if_the_needle_is_where_it_begi
         asked.append(task)
         return plan_now(task)
 
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, submit=submit), Needle()
+    run, needle = executor(AWAY, submit=submit), Needle()
     pose = run.planner.pose(needle.tail, needle.heading)
     (path,) = run.planner.plan_all(run.procedure, *pose)
     moved = Needle(-0.006 + x, 0.0, turn)
@@ -130,7 +146,7 @@ def test_a_path_planned_before_the_start_is_taken_if_the_needle_is_where_it_begi
 
 
 def test_a_path_planned_before_the_start_is_not_taken_after_a_pause():
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run, needle = executor(AWAY), Needle()
     (path,) = run.planner.plan_all(run.procedure, *run.planner.pose(needle.tail, needle.heading))
     run.start(path)
     run.pause("before a pose has come")
@@ -140,11 +156,10 @@ def test_a_path_planned_before_the_start_is_not_taken_after_a_pause():
 
 
 def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
-    run.start()
+    run, needle = begun(AWAY)
     needle.run(run, 1.0)
     way = needle.way
-    needle.run(run, 2.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
+    needle.run(run, 2.0, lambda: UNMEASURED)
     assert (run.state, needle.way - way < 1e-5) == (ProcedureState.PAUSED, True)  # held, see `MIN_HOLD_SPEED`
     assert "not been measured" in run.reason
     needle.run(run, 60.0)
@@ -153,30 +168,27 @@ def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
 
 @pytest.mark.parametrize("along", [4e-4, -4e-4])
 def test_a_needle_that_is_pulled_is_kept_in_place_while_the_thread_is_not_known(along: float):
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
-    run.start()
+    run, needle = begun(AWAY)
     needle.run(run, 1.0)
     needle.pull = along * needle.heading
     at = needle.tail
-    needle.run(run, 4.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
+    needle.run(run, 4.0, lambda: UNMEASURED)
     assert (run.state, run.is_commanding) == (ProcedureState.PAUSED, True)
     assert math.dist(needle.tail, at) < 1e-4  # pulled by 1.6 mm
-    needle.run(run, 1.0, lambda: replace(KNOWN, problem="nobody holds the page", may_hold=False))
+    needle.run(run, 1.0, lambda: UNHELD)
     assert (run.state, run.is_commanding) == (ProcedureState.PAUSED, False)
     assert math.dist(needle.tail, at) > 3e-4
 
 
 def test_a_wait_for_the_thread_ends_after_the_longest_that_is_allowed_and_one_for_a_person_does_not():
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, max_wait=3.0), Needle()
-    run.start()
+    run, needle = begun(AWAY, max_wait=3.0)
     needle.run(run, 1.0)
-    unmeasured = replace(KNOWN, problem="the thread has not been measured for 1.0 s")
-    needle.run(run, 2.9, lambda: unmeasured)
+    needle.run(run, 2.9, lambda: UNMEASURED)
     assert run.state is ProcedureState.PAUSED
-    needle.run(run, 10.0, lambda: replace(KNOWN, problem="nobody holds the page", may_hold=False))
-    needle.run(run, 2.9, lambda: unmeasured)  # the wait begins anew
+    needle.run(run, 10.0, lambda: UNHELD)
+    needle.run(run, 2.9, lambda: UNMEASURED)  # the wait begins anew
     assert run.state is ProcedureState.PAUSED
-    needle.run(run, 0.3, lambda: unmeasured)
+    needle.run(run, 0.3, lambda: UNMEASURED)
     way = needle.way
     needle.run(run, 5.0)
     assert (run.state, run.is_commanding, needle.way) == (ProcedureState.FAILED, False, way)
@@ -206,8 +218,7 @@ class Planning:
 
 def test_a_needle_is_kept_in_place_while_its_path_is_planned():
     planning = Planning()
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, submit=planning.submit), Needle()
-    run.start()
+    run, needle = begun(AWAY, submit=planning.submit)
     needle.pull, at = 4e-4 * needle.heading, needle.tail
     needle.run(run, 3.0)
     assert (run.state, run.path, len(planning.tasks)) == (ProcedureState.RUNNING, None, 1)
@@ -220,36 +231,26 @@ def test_a_needle_is_kept_in_place_while_its_path_is_planned():
 
 
 def test_a_needle_that_rests_backs_off_and_is_given_up_in_the_end():
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run, needle = begun(AWAY)
     needle.share = 0.0
-    run.start()
-    needle.run(run, 60.0)
-    assert run.state is ProcedureState.FAILED
-    assert "given up" in run.reason
+    give_up(run, needle, "given up")
     assert needle.time < 30.0
     assert not run.update(needle.time, needle.tail, needle.heading, KNOWN).any()
 
 
 def test_a_needle_that_is_held_at_the_wall_is_given_up_with_the_place_and_the_remedy():
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle(0.01472, 0.0)
+    run, needle = begun(AWAY)[0], Needle(0.01472, 0.0)
     needle.share = 0.0
-    run.start()
-    needle.run(run, 60.0)
-    assert "the needle rests beside wall with motion_compensation of the coil bridge off, however" in run.reason
+    give_up(run, needle, "the needle rests beside wall with motion_compensation of the coil bridge off, however")
 
 
 def test_a_tightened_thread_ends_its_goal_and_one_that_stays_slack_fails():
     goal = {"tighten": {"tension": 1e-4, "toward": [-0.012, 0.0]}}
-    run, needle = executor(goal), Needle()
-    run.start()
+    run, needle = begun(goal)
     needle.run(run, 60.0, lambda: replace(KNOWN, tension=2e-4 if needle.time > 2.0 else 0.0))
     assert run.state is ProcedureState.DONE
     assert needle.time == pytest.approx(2.0, abs=0.2)
-    run, needle = executor(goal), Needle()
-    run.start()
-    needle.run(run, 60.0)
-    assert run.state is ProcedureState.FAILED
-    assert "not tight" in run.reason
+    give_up(*begun(goal), "not tight")
 
 
 @pytest.mark.parametrize("left", [1e-3, 8e-3])
@@ -258,8 +259,7 @@ def test_a_thread_is_tight_wherever_that_is_on_the_path(left: float):
         {"wrap": {"around": "post", "angle": 2.0}},
         {"tighten": {"tension": 1e-4, "toward": [-0.010, 0.006]}},
     ]
-    run, needle = executor(*goals), Needle()
-    run.start()
+    run, needle = begun(*goals)
     needle.run(run, 60.0, until=lambda: run.goal == 1 and run.is_tracking)
 
     def condition() -> ThreadCondition:
@@ -272,7 +272,7 @@ def test_a_thread_is_tight_wherever_that_is_on_the_path(left: float):
 
 def test_tension_near_its_limit_slows_the_needle_down():
     """A thread whose tension grows with the speed is pulled no harder than the limit."""
-    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, tension=1e-4), Needle(0.008, 0.008, math.pi)
+    run, needle = executor(AWAY, tension=1e-4), Needle(0.008, 0.008, math.pi)
     run.start()
     tensions: list[float] = []
 
@@ -288,8 +288,7 @@ def test_tension_near_its_limit_slows_the_needle_down():
 
 
 def test_a_shape_that_closes_the_way_fails_the_procedure_with_the_reason():
-    run, needle = executor({"wrap": {"around": "post", "angle": 6.0}}), Needle()
-    run.start()
+    run, needle = begun({"wrap": {"around": "post", "angle": 6.0}})
     needle.run(run, 1.0)
     run.set_planner(NeedlePlanner(Scene(Dish()), NEEDLE, 2.5e-4, 0.05))  # the post is gone
     assert run.state is ProcedureState.FAILED
@@ -300,8 +299,7 @@ GOAL_WITH_A_TURN = {"position": [-0.008, -0.004], "heading": [-math.pi / 2.0]}
 
 
 def test_a_place_that_is_missed_however_it_is_planned_is_given_up_with_the_distance():
-    run, needle = executor({"go_to": {**GOAL_WITH_A_TURN, "tolerance": 5e-5}}), Needle()
-    run.start()
+    run, needle = begun({"go_to": {**GOAL_WITH_A_TURN, "tolerance": 5e-5}})
     for _ in range(round(120.0 * RATE)):
         needle.pull = np.array([6e-4 if run.pursuit.misses % 2 else -6e-4, 0.0])  # that nobody compensates
         needle.run(run, 1.0 / RATE)
@@ -338,8 +336,7 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
 @pytest.mark.slow
 def test_a_thread_that_slips_off_is_wound_again_and_given_up_in_the_end():
     """The needle goes round, and the thread stays straight: what counts is the thread."""
-    run, needle = executor({"wrap": {"around": "post", "angle": 6.2}}), Needle()
-    run.start()
+    run, needle = begun({"wrap": {"around": "post", "angle": 6.2}})
     needle.run(run, 600.0, lambda: replace(KNOWN, vertices=np.array([needle.tail, [-0.012, 0.0]])))
     assert run.state is ProcedureState.FAILED
     assert "the thread slips on post: it winds" in run.reason
@@ -348,8 +345,7 @@ def test_a_thread_that_slips_off_is_wound_again_and_given_up_in_the_end():
 
 def test_a_wrap_that_has_slipped_off_at_the_end_fails_the_procedure():
     goals: list[dict[str, Any]] = [{"wrap": {"around": "post", "angle": 6.2}}, {"go_to": {"position": [-0.006, 0.004]}}]
-    run, needle = executor(*goals), Needle()
-    run.start()
+    run, needle = begun(*goals)
 
     def condition() -> ThreadCondition:
         thread = needle.thread if run.goal == 0 else np.array([needle.tail, [-0.012, 0.0]])
@@ -360,14 +356,15 @@ def test_a_wrap_that_has_slipped_off_at_the_end_fails_the_procedure():
     assert "the thread slips on post" in run.reason
 
 
+THROUGH: list[dict[str, Any]] = [
+    {"pass_through": {"between": ["post", "wall"], "direction": [0.0, 1.0]}},
+    {"go_to": {"position": [0.003, 0.008]}},
+]
+
+
 def test_a_needle_that_is_carried_past_a_gap_goes_back_and_passes_it():
     """It is where its path ends, but has not crossed the line across the gap."""
-    goals: list[dict[str, Any]] = [
-        {"pass_through": {"between": ["post", "wall"], "direction": [0.0, 1.0]}},
-        {"go_to": {"position": [0.003, 0.008]}},
-    ]
-    run, needle = executor(*goals), Needle(0.010, -0.006, 1.5)
-    run.start()
+    run, needle = begun(*THROUGH)[0], Needle(0.010, -0.006, 1.5)
     needle.run(run, 60.0, until=lambda: needle.middle[1] > -0.002)
     assert (run.goal, run.judge.crossed) == (0, 0)
     for x in np.arange(needle.tail[0], -0.004, -0.004):  # carried around the post on its other side
@@ -381,20 +378,12 @@ def test_a_needle_that_is_carried_past_a_gap_goes_back_and_passes_it():
 
 
 def test_a_shape_that_appears_in_a_gap_ahead_fails_the_procedure_and_one_in_a_gap_passed_does_not():
-    goals: list[dict[str, Any]] = [
-        {"pass_through": {"between": ["post", "wall"], "direction": [0.0, 1.0]}},
-        {"go_to": {"position": [0.003, 0.008]}},
-    ]
     plug = SceneShape("plug", "instrument", Disc((0.0112, 0.0), 0.004))
     for passed, y in ((False, -0.002), (True, 0.002)):
-        run, needle = executor(*goals), Needle(0.010, -0.006, 1.5)
-        run.start()
+        run, needle = begun(*THROUGH)[0], Needle(0.010, -0.006, 1.5)
         needle.run(run, 60.0, until=partial(lambda needle, y: bool(needle.middle[1] > y), needle, y))
         run.set_planner(NeedlePlanner(Scene(Dish(), (POST, plug)), NEEDLE, 2.5e-4, 0.05))
-        if not passed:
-            assert run.state is ProcedureState.FAILED
-            assert "a gap in which plug does not lie" in run.reason
-        else:
-            assert run.state is ProcedureState.RUNNING
+        assert run.state is (ProcedureState.RUNNING if passed else ProcedureState.FAILED)
+        assert passed or "a gap in which plug does not lie" in run.reason
         run.set_planner(NeedlePlanner(Scene(Dish()), NEEDLE, 2.5e-4, 0.05))  # the post is gone, and done with
         assert run.state is (ProcedureState.RUNNING if passed else ProcedureState.FAILED)

@@ -24,8 +24,7 @@ KEEP_OUT = 2.5e-4
 
 def posts(*discs: tuple[float, float, float]) -> Scene:
     """Return a scene of posts in a dish of 35 mm: x, y and radius of each [m]."""
-    shapes = tuple(SceneShape(f"post_{k}", "instrument", Disc((x, y), r)) for k, (x, y, r) in enumerate(discs))
-    return Scene(Dish(), shapes)
+    return Scene.create(shapes={f"post_{k}": Disc((x, y), r) for k, (x, y, r) in enumerate(discs)})
 
 
 def procedure(*goals: dict[str, Any]) -> Procedure:

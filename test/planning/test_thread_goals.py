@@ -15,18 +15,13 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.planning.executor import ProcedureExecutor, ThreadCondition
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
-from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
 from magnetosuture_thread.planning.verdict import GoalJudge
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.prediction import NeedlePose
+from test.planning.test_planner import procedure
 
 POST = Scene(Dish(0.05), (SceneShape("post", "instrument", Disc((0.0, 0.0), 0.002)),))
-
-
-def procedure(*goals: dict[str, Any]) -> Procedure:
-    """Return a procedure of some goals."""
-    return parse_procedure({"goals": list(goals)}, "test")
 
 
 def around(degrees: float, radius: float = 0.003) -> np.ndarray:

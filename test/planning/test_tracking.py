@@ -30,21 +30,8 @@ def path(angles: np.ndarray) -> BodyPath:
     return BodyPath(middles, angles, 0.5 * NEEDLE.chord, leeway, np.array([made.length]))
 
 
-def headings(
-    tracker: PathTracker,
-    pull: float,
-    age: float = 0.0,
-    intervals: Sequence[float] = (1.0 / RATE,),
-) -> np.ndarray:
-    """Return the headings of an ideal needle on a path [rad]; see `poses`."""
-    return poses(tracker, pull, age, intervals)[:, 2]
-
-
 def poses(
-    tracker: PathTracker,
-    pull: float,
-    age: float = 0.0,
-    intervals: Sequence[float] = (1.0 / RATE,),
+    tracker: PathTracker, pull: float, age: float = 0.0, intervals: Sequence[float] = (1.0 / RATE,)
 ) -> np.ndarray:
     """Return middle and heading of an ideal needle on a path, whose pull to the left of the path the coils compensate.
 
@@ -74,7 +61,7 @@ def poses(
 @pytest.mark.parametrize("pull", [0.0, 6e-4, -1.2e-3])
 @pytest.mark.parametrize("axis", COIL_ANGLES)
 def test_a_needle_that_is_pulled_aside_stays_off_the_axis_of_a_coil(axis: float, pull: float):
-    off = headings(PathTracker(path(np.full(18, axis)), AXES), pull)[round(0.5 * RATE) :] - axis
+    off = poses(PathTracker(path(np.full(18, axis)), AXES), pull)[round(0.5 * RATE) :, 2] - axis
     assert len(off) >= 6
     assert np.abs(off).min() >= 0.9 * abs(pull) / HELD
     assert np.all(off > 0.0) or np.all(off < 0.0) or not pull
@@ -111,7 +98,7 @@ def test_a_needle_whose_pull_nobody_measures_is_driven_along_itself(drive: float
 @pytest.mark.parametrize("rate", [10.0, 20.0, 30.0, 60.0])
 def test_an_axis_is_crossed_at_once_and_no_farther_than_the_needle_stays_off_it(age: float, rate: float):
     tracker = PathTracker(path(np.linspace(0.4, -0.4, 80)), AXES)
-    off = headings(tracker, 3e-3, age=age, intervals=(1.0 / rate,))
+    off = poses(tracker, 3e-3, age, (1.0 / rate,))[:, 2]
     before, after = np.flatnonzero(off > 0.9 * MAX_AXIS_ANGLE)[-1], np.flatnonzero(off < -0.9 * MAX_AXIS_ANGLE)[0]
     assert after - before <= max(2.0, 0.16 * rate)
     assert off[after:].min() > -0.45
@@ -160,7 +147,7 @@ def test_the_setpoint_goes_on_while_frames_are_lost_for_as_long_as_a_command_las
 def test_no_heading_off_an_axis_takes_more_than_half_of_the_leeway():
     narrow = path(np.full(80, 0.0))
     narrow = BodyPath(narrow.middles, narrow.angles, narrow.lever, np.full(80, 1e-4), narrow.ends)
-    assert np.abs(headings(PathTracker(narrow, AXES), 3e-3)).max() <= 0.5 * 1e-4 / narrow.lever + 1e-9
+    assert np.abs(poses(PathTracker(narrow, AXES), 3e-3)[:, 2]).max() <= 0.5 * 1e-4 / narrow.lever + 1e-9
 
 
 def test_before_a_crossing_the_needle_is_on_the_side_that_the_turn_takes_it_from():

@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 
 from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, Line, RoboClawBoard, StageProcess, checksum
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
+from test.shared import wait_until
 
 # Of the supply: a half, and a quarter reversed.
 HALF_AND_BACK = bytes((129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))
@@ -38,23 +40,27 @@ def stage(tmp_path: Path) -> Iterator[StageProcess]:
     made.close()
 
 
-def wait(condition: Callable[[], bool], what: str) -> None:
-    """Wait until a condition holds."""
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline, f"waited 10 s for {what}"
-        time.sleep(0.005)
+@contextmanager
+def opened(path: Path) -> Iterator[int]:
+    """Open a board's line."""
+    device = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        yield device
+    finally:
+        os.close(device)
+
+
+def send(device: int, packet: bytes) -> None:
+    """Send a packet to a board, which acknowledges it."""
+    os.write(device, packet + checksum(packet).to_bytes(2, "big"))
+    assert os.read(device, 1) == ACKNOWLEDGED
 
 
 def test_boards_elsewhere_are_written_to_here_and_their_currents_read(stage, tmp_path):
     assert stage.currents()[0] == pytest.approx(4 * [0.0])
-    device = os.open(tmp_path / "b", os.O_RDWR | os.O_NOCTTY)
-    try:
-        os.write(device, HALF_AND_BACK + checksum(HALF_AND_BACK).to_bytes(2, "big"))
-        assert os.read(device, 1) == ACKNOWLEDGED
-        wait(lambda: stage.currents()[0] == pytest.approx([0.0, 0.0, 12.0, -6.0], abs=0.05), "the currents")
-    finally:
-        os.close(device)
+    with opened(tmp_path / "b") as device:
+        send(device, HALF_AND_BACK)
+        wait_until(lambda: stage.currents()[0] == pytest.approx([0.0, 0.0, 12.0, -6.0], abs=0.05), "the currents")
     stage.close()
     stage.close()
     assert not list(tmp_path.iterdir())
@@ -62,14 +68,10 @@ def test_boards_elsewhere_are_written_to_here_and_their_currents_read(stage, tmp
 
 def test_a_look_that_comes_late_gets_all_that_has_flowed(stage, tmp_path):
     _, begin = stage.currents()
-    device = os.open(tmp_path / "b", os.O_RDWR | os.O_NOCTTY)
-    try:
+    with opened(tmp_path / "b") as device:
         for packet in (HALF_AND_BACK, ZEROS):
-            os.write(device, packet + checksum(packet).to_bytes(2, "big"))
-            assert os.read(device, 1) == ACKNOWLEDGED
+            send(device, packet)
             time.sleep(0.1)
-    finally:
-        os.close(device)
     currents, end = stage.currents()
     flowed = (end - begin) * currents[2:]
     assert flowed[1] == pytest.approx(-0.5 * flowed[0], rel=1e-3)
@@ -121,20 +123,17 @@ def test_boards_go_with_a_rig_that_is_killed(tmp_path):
     finally:
         rig.kill()
         rig.communicate()
-    wait(lambda: not list(tmp_path.iterdir()), "the boards to be taken away")
+    wait_until(lambda: not list(tmp_path.iterdir()), "the boards to be taken away")
 
 
 def main_voltage(path: Path) -> float:
     """Return what the board at a path answers, once it has answered whole or 10 s are over [V]."""
-    device = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    try:
+    with opened(path) as device:
         os.write(device, question := bytes((128, Command.GET_MAIN_VOLTAGE)))
         answer, until = b"", time.monotonic() + 10.0
         while len(answer) < 4 and (left := until - time.monotonic()) > 0.0:
             if select.select([device], [], [], left)[0]:
                 answer += os.read(device, 100)
-    finally:
-        os.close(device)
     assert answer[2:] == checksum(question + answer[:2]).to_bytes(2, "big")
     return 0.1 * int.from_bytes(answer[:2], "big")
 
