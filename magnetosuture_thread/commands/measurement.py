@@ -19,7 +19,7 @@ import yaml
 
 from magnetosuture_thread.nodes.processes import end_with_parent
 from magnetosuture_thread.settings.configuration import to_mapping
-from magnetosuture_thread.settings.errors import shortened
+from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, shortened
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
@@ -28,7 +28,7 @@ TEACH = "teach"
 # so does its view, with the check that the dish is where it was.
 TAUGHT = ("needle_width", "max_needle_brightness", "needle_colour", "needle_is_blunt", "max_needle_bend")
 RUNNING, DONE, FAILED = "running", "done", "failed"
-MAX_LINES, MAX_CHARS = 40, 400  # that a page is sent
+MAX_LINES = 40  # that a page is sent
 END_TIMEOUT = 20.0  # s for a command to end by itself, once it is cancelled: it starts nodes anew as they were
 
 
@@ -71,7 +71,7 @@ class Measurement:
         assert process.stdout is not None
         async for line in process.stdout:
             if text := line.decode(errors="replace").strip():
-                self.lines.append(shortened(text, MAX_CHARS))
+                self.lines.append(shortened(text, MAX_REASON_CHARS))
         return await process.wait() == 0
 
     def cancel(self) -> None:

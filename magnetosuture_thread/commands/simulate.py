@@ -37,7 +37,7 @@ from magnetosuture_thread.settings.files import find_file, whole_folder
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.NEEDLE_TIP, topics.TIP_SETPOINT, topics.FAULT_REQUEST),
-    *(topics.MATERIAL, *topics.ON_REQUEST, *topics.PROCEDURES),
+    *(topics.MATERIAL, topics.FORECAST, *topics.PROCEDURES),
 )
 INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder

@@ -34,9 +34,9 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reading import constant_name
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, read_report
+from magnetosuture_thread.nodes.node import GuardedNode, read_report
 from magnetosuture_thread.nodes.parameters import start_ros
-from magnetosuture_thread.settings.errors import GraphError, shortened
+from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, GraphError, shortened
 from magnetosuture_thread.settings.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, STARTS, Service
 
 TIMEOUT = 10.0  # s for a service to be found and to answer

@@ -32,12 +32,12 @@ from magnetosuture_thread.geometry.needle_arc import heading_angle
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import ACTIONS, Inbox, Latest, Services
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
+from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.settings import interface
-from magnetosuture_thread.settings.errors import GraphError, shortened
+from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, GraphError, shortened
 from magnetosuture_thread.settings.files import shipped_names
 from magnetosuture_thread.thread.margins import node_clearance
 from magnetosuture_thread.vision.images import image_of
@@ -496,7 +496,7 @@ def procedure(message: msg.ProcedureState) -> dict[str, Any]:
         "state": constant_name(message, message.state, "STATE_", "failed"),
         "name": shortened(message.procedure),
         **_plain(message, "goals goal goals_met progress resumes hold_to_run"),
-        "reason": shortened(message.reason, 400),
+        "reason": shortened(message.reason, MAX_REASON_CHARS),
         "clearance": message.clearance if np.isfinite(message.clearance) else None,
     }
 

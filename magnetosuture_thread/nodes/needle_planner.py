@@ -27,7 +27,7 @@ from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, ManagedNode, SceneFollower, check_pressed, reason_of
+from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower, check_pressed, reason_of
 from magnetosuture_thread.nodes.parameters import settings_of
 from magnetosuture_thread.nodes.processes import leave_priority
 from magnetosuture_thread.planning import session
@@ -35,7 +35,7 @@ from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
 from magnetosuture_thread.settings import interface
-from magnetosuture_thread.settings.errors import shortened
+from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
 

@@ -38,14 +38,13 @@ from magnetosuture_thread.nodes.parameters import declare, plain_value
 from magnetosuture_thread.nodes.processes import raise_priority, without_priority
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
-from magnetosuture_thread.settings.errors import GraphError, shortened
+from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, GraphError, shortened
 
 C = TypeVar("C", bound=Configuration)
 
 PERIOD = 1.0  # s between two reports of a node
 COMPILING = "compiling"  # how the state of a node begins that does
 SCHEDULING = "scheduling"  # key of a report on /diagnostics
-MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 MAX_REQUEST_ENTRIES = 1000  # of a list in a request: each takes its time, and nothing else runs meanwhile
 SUCCESS = TransitionCallbackReturn.SUCCESS
 INACTIVE = "inactive: messages are not used until the node is activated"

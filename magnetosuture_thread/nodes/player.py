@@ -161,7 +161,7 @@ class LiveReplay(Participant):
             unnoticed = (interface.CAMERA_INFO.recorded, interface.SCENE.recorded)
             publishers = [pair for pair in self._inputs.items() if pair[0] not in unnoticed]
             missing = [name for name, publisher in publishers if not publisher.get_subscription_count()]
-            heard = [pair for pair in self._outputs.items() if pair[0] not in topics.ON_REQUEST]
+            heard = [pair for pair in self._outputs.items() if pair[0] is not topics.FORECAST]  # by request
             missing += [topic.name for topic, subscription in heard if not subscription.get_publisher_count()]
             if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")

@@ -197,9 +197,6 @@ configuration_fields = cast("Callable[[type[Configuration]], tuple[Configuration
 """Return the fields of a configuration class."""
 
 
-WORDS: dict[type, str] = {bool: "true or false", NoneType: "nothing"}
-
-
 def bounded(*arguments: Any, **options: Any) -> Quantity:
     """Return a quantity without a description, to annotate an argument's type, as in `Annotated[float, LENGTH]`."""
     return Quantity("", *arguments, **options)
@@ -268,7 +265,8 @@ def _checker(hint: Any) -> Callable[[str, Any], Any] | None:
 
     def check_class(name: str, value: Any) -> Any:
         if not isinstance(value, classes) or (isinstance(value, str) and str not in classes):
-            words = [WORDS.get(kind, f"an instance of {kind.__name__}") for kind in classes]
+            usual = {bool: "true or false", NoneType: "nothing"}
+            words = [usual.get(kind, f"an instance of {kind.__name__}") for kind in classes]
             raise ConfigurationError(name, value, " or ".join(words))
         if entries and isinstance(value, (list, tuple)) and (check := _checker(entries[0])) is not None:
             for index, item in enumerate(value):

@@ -10,10 +10,7 @@ from pathlib import Path
 from typing import Any
 
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
-MAX_CHARS = 100  # of a text from outside, wherever it is stored, logged, published or drawn
-
-_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
-_ROS = re.compile(r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|rosidl)_?.*|.+_(msgs|srvs|interfaces)(_py)?")
+MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 
 
 def printable(text: str) -> str:
@@ -34,8 +31,8 @@ def one_line(text: str) -> str:
     return printable(text).replace("\n", "\\n").replace("\t", "\\t")
 
 
-def shortened(text: str, max_chars: int = MAX_CHARS) -> str:
-    """Return a text from outside as `one_line`, of at most so many characters.
+def shortened(text: str, max_chars: int = 100) -> str:
+    """Return a text from outside as `one_line`, of at most so many characters, to store, log, publish or draw.
 
     >>> shortened("frame" * 1000, 12)
     'frameframef…'
@@ -50,10 +47,12 @@ def missing_module(error: ModuleNotFoundError) -> str:
     # Modules of the extra `cluster`.
     if module in ("dask", "distributed", "fsspec", "pyarrow", "s3fs", "upath"):
         return f"{error}; clusters and bags by URL need the extra: pip install '.[cluster]'"
-    if _ROS.fullmatch(module):
+    ros = r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|rosidl)_?.*|.+_(msgs|srvs|interfaces)(_py)?"
+    if re.fullmatch(ros, module):
         sourced = "source the setup.bash of ROS, and of the workspace where this package is built"
         return f"{error}; nodes and the live graph need ROS 2 Jazzy: {sourced}; without ROS: pip install '.[ros]'"
-    name = _DISTRIBUTIONS.get(module, module)
+    names = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
+    name = names.get(module, module)
     with suppress(PackageNotFoundError):
         needs = [line.split(";")[0].strip() for line in requires("magnetosuture_thread") or ()]
         name = next((need for need in needs if re.split("[^A-Za-z0-9_.-]", need)[0].lower() == name.lower()), name)

@@ -33,7 +33,6 @@ from magnetosuture_thread.settings.errors import ConfigurationError
 
 PARAMETERS = "ros__parameters"
 EVERY_NODE = "/**"
-MAX_NEEDLE_TURN = 1.02 * math.pi  # of a needle, tail to tip [rad]; a little more than what suture needles have
 
 
 @dataclass(frozen=True)
@@ -148,8 +147,9 @@ def check_needle(group: str, length: float, curvature: float) -> None:
     Raises:
         ConfigurationError: the arc turns by more.
     """
-    if abs(curvature) * length > MAX_NEEDLE_TURN:
-        expectation = f"at most {MAX_NEEDLE_TURN / length:.0f} 1/m, a half circle for a needle of {length:g} m"
+    max_turn = 1.02 * math.pi  # tail to tip [rad]; a little more than what suture needles have
+    if abs(curvature) * length > max_turn:
+        expectation = f"at most {max_turn / length:.0f} 1/m, a half circle for a needle of {length:g} m"
         raise ConfigurationError(f"{group}.needle_curvature", curvature, expectation)
 
 
