@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import io
 import os
 import signal
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
-from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe
+from magnetosuture_thread.commands.command import DONE, FAILED, WRONG_USE, Terminal, check_outputs, describe, runs
 from magnetosuture_thread.settings.errors import missing_module
 
 DESCRIPTION = """\
@@ -21,7 +22,8 @@ Predicts where a suture thread goes behind a magnetically steered needle.
 Research software, no medical device. Lengths are in metres and times in seconds throughout.
 """
 # Name and summary of each command. The file of `commands` is imported when the command is given, so that --help is
-# quick; what it does after a hyphen is `add_...` in that file.
+# quick. In it `add`, or `add_...` of what comes after a hyphen, adds the arguments, and `run_...` does the work; the
+# docstring of the latter is the text under --help, and that of `add` where there are sub-commands.
 COMMANDS = {
     "replay": "play a recorded bag through the live graph, or offline",
     "render": "write a bag of simulated camera frames, or poses",
@@ -61,7 +63,11 @@ def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentPa
         if name in names:
             verb, _, kind = name.partition("-")
             module = import_module(f"magnetosuture_thread.commands.{verb}")
-            getattr(module, f"add_{kind}" if kind else "add")(subparser)
+            add = getattr(module, f"add_{kind}" if kind else "add")
+            describe(subparser, inspect.getdoc(add) or "")
+            if run := getattr(module, f"run_{name.replace('-', '_')}", None):
+                runs(subparser, run)
+            add(subparser)
     return parser
 
 
@@ -72,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def run() -> int:
         options = make_parser(words[:1]).parse_args(words)
         check_outputs(options)
-        return int(options.run(options, Terminal()))
+        return int(options.run(options, Terminal()) or DONE)
 
     return exit_code(run)
 

@@ -18,16 +18,13 @@ from magnetosuture_thread.commands import command
 from magnetosuture_thread.settings.errors import one_line
 from magnetosuture_thread.settings.files import whole_folder
 
-DESCRIPTION = """\
-Check a recorded bag, or repair it.
-
-BAG is an mcap or sqlite3 file of any recorder, or the folder of a bag.
-"""
-
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments."""
-    check, repair = command.add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, repair=run_repair)
+    """Check a recorded bag, or repair it.
+
+    BAG is an mcap or sqlite3 file of any recorder, or the folder of a bag.
+    """
+    check, repair = command.add_actions(parser, "what to do", "ACTION", check=run_check, repair=run_repair)
     for action in (check, repair):
         action.add_argument("bag", type=Path, metavar="BAG", help="a bag's file or folder")
         command.add_remap(action)
@@ -55,7 +52,7 @@ def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     return command.FAILED if is_doubtful else command.DONE
 
 
-def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Write every intact message of a bag into a new one.
 
     Messages, their times and numbers, definitions and notes stay as they are; chunks, indices and metadata.yaml are
@@ -86,7 +83,6 @@ def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> int:
     lines += _shown([f"{place}{_times(place.first, place.last, bag.start)}" for place in places])
     for line in (*lines, f"{report.messages} messages in {options.output}"):
         terminal.log(line)
-    return command.DONE
 
 
 def _times(first: int | None, last: int | None, start: int) -> str:

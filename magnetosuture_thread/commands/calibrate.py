@@ -27,7 +27,6 @@ MAX_FRAMES = 50  # that a camera is calibrated by
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_calibrate)
     option, file = parser.add_argument, command.output_file
     bags = "an mcap file, or the folder of a bag, or its URL"
     option("bags", type=command.bag_location, nargs="+", metavar="BAG", help=bags)
@@ -122,7 +121,6 @@ def _bag_table(figures: dict[str, Any]) -> Table:
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_calibrate_camera)
     option = parser.add_argument
     command.add_frames(parser)
     command.add_dish(parser)
@@ -135,7 +133,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     option("--output", type=command.output_file, required=True, metavar="FILE", help="parameter file to write")
 
 
-def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Find where the dish is in the camera's image.
 
     The result is its centre, the scale and, by markers, the rotation. FILE gets a section vision_tracker of a ROS 2
@@ -192,19 +190,17 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     if result.needle is not None:
         terminal.log(f"the needle is {1e3 * result.needle[0]:.3f} mm long")
     terminal.log(f"parameters: {options.output}, for track --setup with --dish-diameter {options.dish_diameter:g}")
-    return command.DONE
 
 
 def add_coils(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_calibrate_coils)
     option = parser.add_argument
     option("measurements", type=Path, metavar="MEASUREMENTS", help="CSV file")
     option("--output", type=command.output_file, required=True, metavar="FILE", help="calibration to write (YAML)")
     option("--name", default="", metavar="RIG", help="the rig's name (default: the file's)")
 
 
-def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Find the coils' properties from probe measurements.
 
     The model of the coils is fitted to what a probe measured in the dish, and written as a calibration, which the
@@ -235,7 +231,6 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal)
         if poor:
             terminal.log(f"{coil.name}: poorly determined {', '.join(poor)}; measure all over the dish")
     terminal.log(f"calibration: {options.output}")
-    return command.DONE
 
 
 def _coil_table(fit: CalibrationFit) -> Table:

@@ -37,7 +37,6 @@ MAX_PANELS = 12  # failed runs that are drawn; the figures of all are in the tab
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_campaign)
     option = parser.add_argument
     option("procedure", metavar="PROCEDURE", help="a procedure's name or YAML file")
     count, first = command.count_argument("runs", 1, 100_000), command.count_argument("a seed", 0, 2**31 - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from magnetosuture_thread.commands.command import DONE, Terminal, namespace_argument, runs
+from magnetosuture_thread.commands.command import Terminal, namespace_argument
 from magnetosuture_thread.nodes.clients import CoilClient
 
 ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "deactivate", "cleanup")
@@ -12,12 +12,11 @@ ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_coils)
     parser.add_argument("action", choices=ACTIONS, metavar="ACTION", help=", ".join(ACTIONS))
     parser.add_argument("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the bridge")
 
 
-def run_coils(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_coils(options: argparse.Namespace, terminal: Terminal) -> None:
     """Arm, disarm, stop or reset the running coil bridge.
 
     The command acts on the coil bridge that runs on this ROS domain, and shows its state.
@@ -43,4 +42,3 @@ def run_coils(options: argparse.Namespace, terminal: Terminal) -> int:
     width = max(len(name) for name in state)
     for name, value in state.items():
         terminal.log(f"{name:{width}}  {value}")
-    return DONE

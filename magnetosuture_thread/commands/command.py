@@ -28,7 +28,7 @@ STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks
 EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
 OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
 
-Run: TypeAlias = "Callable[[argparse.Namespace, Terminal], int]"
+Run: TypeAlias = "Callable[[argparse.Namespace, Terminal], int | None]"  # returns the exit code; None is `DONE`
 
 
 def describe(parser: argparse.ArgumentParser, text: str) -> None:
@@ -38,30 +38,22 @@ def describe(parser: argparse.ArgumentParser, text: str) -> None:
 
 
 def runs(parser: argparse.ArgumentParser, run: Run) -> None:
-    """Make a parser that of a command.
-
-    Args:
-        parser: that has no arguments yet.
-        run: the command, called with options and terminal; returns the exit code. Its docstring is the text under
-            --help.
-    """
+    """Make a parser that of a command, whose docstring is the text under --help."""
     describe(parser, inspect.getdoc(run) or "")
     parser.set_defaults(run=run)
 
 
 def add_actions(
-    parser: argparse.ArgumentParser, text: str, title: str, metavar: str, **actions: Run
+    parser: argparse.ArgumentParser, title: str, metavar: str, **actions: Run
 ) -> list[argparse.ArgumentParser]:
     """Add sub-commands to a command, and return their parsers.
 
     Args:
         parser: of the command.
-        text: under its --help.
         title: of the list of sub-commands.
         metavar: what stands for them.
         actions: what each does; an underscore in a name is a hyphen.
     """
-    describe(parser, text)
     subparsers = parser.add_subparsers(title=title, metavar=metavar, required=True)
     parsers = []
     for name, run in actions.items():

@@ -37,7 +37,6 @@ from magnetosuture_thread.settings.errors import BagError
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_commission)
     option = parser.add_argument
     option("setup", metavar="SETUP", help="what is believed of the rig: a setup's name or YAML file")
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")

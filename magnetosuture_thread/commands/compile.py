@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
-from magnetosuture_thread.commands.command import DONE, Terminal, runs
+from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
@@ -20,11 +20,10 @@ from magnetosuture_thread.vision.tracker import warm_up
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments."""
-    runs(parser, run_compile)
+    """Add no arguments."""
 
 
-def run_compile(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_compile(options: argparse.Namespace, terminal: Terminal) -> None:
     """Compile the functions that every node runs, so that nodes start at once.
 
     Compiled functions are cached beside the installed package, or in the user's cache where that cannot be written. A
@@ -39,7 +38,6 @@ def run_compile(options: argparse.Namespace, terminal: Terminal) -> int:
         what = "compiled" if compilations() > before else "cached"
         terminal.print(f"{number} of {len(steps)}  {name}: {what}, {time.perf_counter() - started:.0f} s")
     terminal.print(f"all functions are compiled, {time.perf_counter() - began:.0f} s")
-    return DONE
 
 
 def kernel_steps() -> dict[str, Callable[[], object]]:

@@ -47,7 +47,6 @@ SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  #
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_console)
     option = parser.add_argument
     option("setup", metavar="SETUP", nargs="?", default="", help="its name or YAML file (default: of a 35 mm dish)")
     graph = parser.add_mutually_exclusive_group()
@@ -65,7 +64,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--record", type=Path, default=Path("output/recordings"), metavar="DIR", help=recordings)
 
 
-def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_console(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Serve the operator's page.
 
     It shows the dish with needle and thread, the margins and the state of all nodes; the needle is jogged by arrow
@@ -114,7 +113,6 @@ def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
             what = "the graph around a simulated rig" if source is None else ", ".join(source.nodes)
             log(f"starting {what} (ROS domain {domain}, this machine only)")
         asyncio.run(_serve(graph, host, log))
-    return command.DONE
 
 
 async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:

@@ -38,7 +38,6 @@ MARKS = {"simulated": "* simulated", "unverified": "? unverified", "silences": "
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_evaluate)
     parser.set_defaults(default_of=parser.get_default)
     option = parser.add_argument
     option("paths", type=command.bag_location, nargs="+", metavar="PATH", help="bags, or trajectories; see above")

@@ -30,7 +30,6 @@ EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "no
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_render)
     option = parser.add_argument
     option("reference", type=Path, metavar="REFERENCE", help="a reference trajectory (.npz)")
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
@@ -48,7 +47,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--noise", type=command.number_argument(0.0, 1e-2), default=0.0, metavar="METRES", help=noise)
 
 
-def run_render(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_render(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Write a bag of simulated camera frames, or poses.
 
     A reference trajectory is rendered as the overhead camera would see it, and written as a bag: JPEG frames,
@@ -64,7 +63,6 @@ def run_render(options: argparse.Namespace, terminal: command.Terminal) -> int:
     with terminal.progress("render") as advance:
         frames = render_bag(reference, setup, options.output, progress=advance, **chosen)
     terminal.log(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
-    return command.DONE
 
 
 def render_bag(

@@ -12,7 +12,6 @@ from magnetosuture_thread.evaluation.tables import summary_table
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_replay)
     option = parser.add_argument
     option("bag", type=command.bag_location, metavar="BAG", help="an mcap file, or the folder of a bag, or its URL")
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
@@ -23,7 +22,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     command.add_source(parser)
 
 
-def run_replay(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_replay(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Play a recorded bag through the live graph, or offline.
 
     vision_tracker, thread_model and coil_bridge run as processes of their own, on a ROS domain that nobody else
@@ -57,4 +56,3 @@ def run_replay(options: argparse.Namespace, terminal: command.Terminal) -> int:
             summary = replay_live(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **chosen)
     terminal.print(summary_table(summary))
     terminal.log(f"results: {options.output}")
-    return command.DONE

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import stamp_of
-from magnetosuture_thread.commands.command import DONE, Terminal, add_actions, make_table
+from magnetosuture_thread.commands.command import Terminal, add_actions, make_table
 from magnetosuture_thread.commands.simulate import measure_loop, simulate
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.recorded import read_image
@@ -31,10 +31,9 @@ SHOWN = 4  # instants of each run
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments."""
-    text = "Reproduce a result of the paper, simulated."
+    """Reproduce a result of the paper, simulated."""
     results = {"hernia": run_hernia, "thread_behavior": run_thread_behavior}
-    hernia, behavior = add_actions(parser, text, "results", "RESULT", **results)
+    hernia, behavior = add_actions(parser, "results", "RESULT", **results)
     hernia.add_argument("bag", type=Path, metavar="BAG", help="a bag with an operator's velocity commands")
     for result in (hernia, behavior):
         result.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
@@ -44,7 +43,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     hernia.add_argument("--animation", action="store_true", help="draw hernia.gif as well")
 
 
-def run_hernia(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_hernia(options: argparse.Namespace, terminal: Terminal) -> None:
     """Replay a recorded steering around a hernia.
 
     The paper's simulated hernia repair: a needle steered by hand draws a thread through a penetration path and
@@ -74,10 +73,9 @@ def run_hernia(options: argparse.Namespace, terminal: Terminal) -> int:
         f"results: {options.output}",
     ):
         terminal.log(line)
-    return DONE
 
 
-def run_thread_behavior(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_thread_behavior(options: argparse.Namespace, terminal: Terminal) -> None:
     """Compare prediction and ground truth in closed loop, by material.
 
     The paper's two thread-behavior tests in a closed loop around the simulated rig, a polyamide thread of 19 mm and
@@ -99,7 +97,6 @@ def run_thread_behavior(options: argparse.Namespace, terminal: Terminal) -> int:
     caption = "errors of the prediction, mean (maximum) over time in % of the thread's length; needle: RMS"
     terminal.print(make_table("thread behavior, closed loop, simulated", columns, cells, caption))
     terminal.log(f"results: {options.output}")
-    return DONE
 
 
 class BehaviorRun(NamedTuple):

@@ -14,18 +14,15 @@ from magnetosuture_thread.commands import command
 from magnetosuture_thread.geometry.scene import scene_warnings
 from magnetosuture_thread.settings.files import whole_file
 
-DESCRIPTION = """\
-Check a scene file, or draw it.
-
-FILE is a YAML or GeoJSON file, or the name of a scene that ships with the
-package, for example dish_35mm or hernia_ring. Its format is in
-docs/how_to/scenes.md.
-"""
-
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments."""
-    check, draw = command.add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, draw=run_draw)
+    """Check a scene file, or draw it.
+
+    FILE is a YAML or GeoJSON file, or the name of a scene that ships with the
+    package, for example dish_35mm or hernia_ring. Its format is in
+    docs/how_to/scenes.md.
+    """
+    check, draw = command.add_actions(parser, "what to do", "ACTION", check=run_check, draw=run_draw)
     for action in (check, draw):
         action.add_argument("file", metavar="FILE", help="a scene's file or name")
     width = "gaps narrower than this are reported [m] (default: %(default)s)"
@@ -37,7 +34,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_check(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Show what a scene holds, with warnings.
 
     A scene file is read, and its dish, its version and its shapes are shown. What is allowed and yet is often a slip is
@@ -62,10 +59,9 @@ def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
         terminal.print("warning:", style="bold yellow", end=" ")
         terminal.log(warning.text)
     command.write_json(options.json, report)
-    return command.DONE
 
 
-def run_draw(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_draw(options: argparse.Namespace, terminal: command.Terminal) -> None:
     """Draw a scene file from above, with names and scale, as PNG or SVG."""
     if options.output.suffix not in (".png", ".svg"):
         raise ConfigurationError("--output", str(options.output), "a file that ends in .png or .svg")
@@ -76,7 +72,6 @@ def run_draw(options: argparse.Namespace, terminal: command.Terminal) -> int:
     with whole_file(options.output) as partial:
         plot_scene(partial, scene, Path(options.file).stem)
     terminal.log(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
-    return command.DONE
 
 
 def _table(report: dict[str, Any]) -> Table:

@@ -49,7 +49,6 @@ MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another cam
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_simulate)
     option = parser.add_argument
     option("setup", metavar="SETUP", help="a setup's name or YAML file")
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
@@ -68,7 +67,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--json", type=command.output_file, metavar="FILE", help="write the figures to a file")
 
 
-def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int:
+def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int | None:
     """Run the whole graph around a simulated rig.
 
     No robot is needed: rig_simulator stands in for coils, dish, needle, thread and camera; vision_tracker,
@@ -92,7 +91,7 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
             chosen |= {"log": terminal.log, "progress": advance}
             if options.bare:
                 host_bare_rig(options.setup, options.output, **chosen)
-                return command.DONE
+                return None
             summary = simulate(options.setup, options.output, procedure=options.procedure, **chosen)
     except KeyboardInterrupt:
         if new and options.output.exists():
@@ -104,7 +103,7 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     terminal.log(f"bag: {options.output}")
     command.write_json(options.json, summary.to_json())
     outcome = summary.procedure
-    return command.FAILED if outcome and outcome["state"] != clients.DONE else command.DONE
+    return command.FAILED if outcome and outcome["state"] != "done" else command.DONE
 
 
 def too_slow(skipped: int, taken: int, rate: float) -> str:

@@ -20,7 +20,6 @@ from magnetosuture_thread.vision.tracker import VisionTracker, warm_up
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_teach)
     option = parser.add_argument
     command.add_frames(parser)
     pixel = command.number_argument(0.0, 1e5)

@@ -45,7 +45,6 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    command.runs(parser, run_track)
     option = parser.add_argument
     command.add_frames(parser)
     add_view(parser)

@@ -43,7 +43,6 @@ TIMEOUT = 10.0  # s for a service to be found and to answer
 POLL_PERIOD = 0.005  # s between two looks at what has come
 DISCOVERY_TIME = 1.0  # s after a node is found, for it to have discovered this client
 
-DONE = "done"
 ACTIONS: dict[str, tuple[Service, Any]] = {
     "arm": (Service.ARM, SetBool.Request(data=True)),
     "disarm": (Service.ARM, SetBool.Request(data=False)),
