@@ -22,17 +22,11 @@ from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, s
 from magnetosuture_thread.evaluation.tables import ReplaySummary
 from magnetosuture_thread.evaluation.workers import Log, Progress
 from magnetosuture_thread.geometry.scene_files import write_scene
-from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes import processes, topics
+from magnetosuture_thread.nodes.clients import Receive
 from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.nodes.node import COMPILING
 from magnetosuture_thread.nodes.player import DEPTH, LiveReplay
-from magnetosuture_thread.nodes.processes import (
-    Interruption,
-    NodeProcesses,
-    environment_of,
-    graph_environment,
-    reserved_domain,
-)
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.files import whole_folder
@@ -63,7 +57,7 @@ def own_domain() -> Iterator[int]:
     Raises:
         GraphError: all domains are in use.
     """
-    with reserved_domain() as domain, environment_of(graph_environment(domain)):
+    with processes.reserved_domain() as domain, processes.environment_of(processes.graph_environment(domain)):
         yield domain
 
 
@@ -77,8 +71,8 @@ class OwnGraph(NamedTuple):
     """
 
     domain: int
-    nodes: NodeProcesses
-    interruption: Interruption
+    nodes: processes.NodeProcesses
+    interruption: processes.Interruption
 
     def check(self) -> None:
         """Raise `KeyboardInterrupt` if a person has interrupted, and `GraphError` if a node has ended."""
@@ -87,13 +81,11 @@ class OwnGraph(NamedTuple):
 
 
 @contextmanager
-def own_graph(
-    processes: Sequence[str], arguments: Sequence[str], logs: Path, what: str, log: Log
-) -> Iterator[OwnGraph]:
+def own_graph(programs: Sequence[str], arguments: Sequence[str], logs: Path, what: str, log: Log) -> Iterator[OwnGraph]:
     """Start nodes in a ROS domain of their own; they are ended with the context.
 
     Args:
-        processes: names of the nodes' programs.
+        programs: that the nodes run as.
         arguments: for each, after `--ros-args`.
         logs: folder that gets a log file of each.
         what: starts, as it is logged.
@@ -104,8 +96,8 @@ def own_graph(
     """
     with own_domain() as domain:
         log(f"starting {what} (ROS domain {domain}, this machine only)")
-        with NodeProcesses(processes, arguments, dict(os.environ), logs) as nodes:
-            yield OwnGraph(domain, nodes, Interruption())
+        with processes.NodeProcesses(programs, arguments, dict(os.environ), logs) as nodes:
+            yield OwnGraph(domain, nodes, processes.Interruption())
 
 
 def log_compiling(texts: Mapping[str, str], logged: set[str], log: Log) -> None:
@@ -183,9 +175,7 @@ class GraphInput:
                     continue
             yield record
 
-    def live(
-        self, domain: int, rate: float, receive: Callable[[str, int, bytes], None], check: Callable[[], None], log: Log
-    ) -> LiveReplay:
+    def live(self, domain: int, rate: float, receive: Receive, check: Callable[[], None], log: Log) -> LiveReplay:
         """Return the node that plays the bag; see `LiveReplay`."""
         known = (*topics.INPUTS, *topics.SETTINGS, *topics.OUTPUTS)
         return LiveReplay(

@@ -6,11 +6,11 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +39,8 @@ OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.NEEDLE_TIP, topics.TIP_SETPOINT, topics.FAULT_REQUEST),
     *(topics.MATERIAL, topics.FORECAST, *topics.PROCEDURES),
 )
-INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
-EXTRA_TIME = 20.0  # s of simulated time
+EXTRA_TIME = 20.0  # s of simulated time, beyond a path's or run's own
 MIN_RATE = 0.5  # of real time; the least that the rig's setting `rate` takes
 MAX_PAUSE = 30.0  # s; in which a person resumes a procedure that does not go on by itself, or nobody is there
 MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another camera than the setup's
@@ -158,11 +157,7 @@ def simulate(
     believed, setup = setup.rig, with_rig(setup, rig)
     task: _Task = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
     problem = _Run(setup, believed, task, duration, rate, boards, log, progress).write(output)
-    if problem == INTERRUPTED:
-        raise KeyboardInterrupt
-    if problem:
-        if task.result is None:
-            raise GraphError(f"{problem}; what was recorded is in {output}")
+    if problem and task.result is not None:
         task.result |= {"state": "failed" if task.stage else task.result["state"], "reason": problem}
     log("evaluating the run")
     figures = {"setup": setup.name, "procedure": task.result}
@@ -213,14 +208,9 @@ def host_bare_rig(
     """
     believed = read_setup(setup_name)
     setup = with_rig(believed, rig)
-    setup = replace(setup, rig=bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))).with_scene(
-        Scene(setup.scene.dish)
-    )
-    problem = _Run(setup, believed.rig, _Bare(), duration, rate, boards, log, progress).write(output)
-    if problem == INTERRUPTED:
-        raise KeyboardInterrupt
-    if problem:
-        raise GraphError(f"{problem}; what was recorded is in {output}")
+    bare = bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))
+    setup = replace(setup, rig=bare).with_scene(Scene(setup.scene.dish))
+    _Run(setup, believed.rig, _Bare(), duration, rate, boards, log, progress).write(output)
 
 
 def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
@@ -234,8 +224,8 @@ def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
     return collector
 
 
-class _Path:
-    """The setup's path, along which the path follower steers.
+class _Task:
+    """What the graph does in a run; by itself nothing, until somebody ends it.
 
     Attributes:
         node: that steers.
@@ -249,11 +239,31 @@ class _Path:
         result: what came of a procedure; None for a path.
     """
 
-    node = "path_follower"
-    arguments: tuple[str, ...] = ()
+    node = ""
+    arguments: Sequence[str] = ()
     recorded: tuple[topics.Topic, ...] = ()
-    stage, share, ended, stuck = 0, 0.0, False, ""
+    time_limit, stage, share, ended, stuck = math.inf, 0, 0.0, False, ""
     result: dict[str, Any] | None = None
+
+    def poll(self, recorder: clients.Recorder) -> None:
+        """Take what is new."""
+
+    def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
+        """Return what to report of a run that does not end."""
+        return ""
+
+
+class _Bare(_Task):
+    """A rig that others commission. The bridge waits for a person to arm it."""
+
+    arguments = live.arguments_of({"coil_bridge:commissioning": "true"})
+    stage = 2
+
+
+class _Path(_Task):
+    """The setup's path, along which the path follower steers."""
+
+    node = "path_follower"
 
     def __init__(self, setup: Setup, duration: float | None) -> None:
         if not setup.follower.waypoints:
@@ -276,8 +286,8 @@ class _Path:
         return f"after {elapsed:.0f} s only {self.share:.0%} of the path is done; {states}"
 
 
-class _Procedure:
-    """A procedure that the needle planner executes; attributes as of `_Path`.
+class _Procedure(_Task):
+    """A procedure that the needle planner executes.
 
     Attributes:
         result: name, state, reason, goals met, goals and minimum clearance of the needle's axis by its measured poses
@@ -290,7 +300,6 @@ class _Procedure:
     node = interface.PLANNER
     recorded = topics.PROCEDURES
     time_limit = 600.0  # s of simulated time, as in a campaign
-    stage, share, ended, stuck = 0, 0.0, False, ""
 
     def __init__(self, name: str, setup: Setup) -> None:
         procedure = read_procedure(name)
@@ -331,26 +340,6 @@ class _Procedure:
         return f"{self.result['state']} after {elapsed:.0f} s{reason}"
 
 
-class _Bare:
-    """Nothing to do, until somebody ends it; attributes as of `_Path`. The bridge waits for a person to arm it."""
-
-    node = ""
-    arguments = tuple(live.arguments_of({"coil_bridge:commissioning": "true"}))
-    recorded: tuple[topics.Topic, ...] = ()
-    time_limit, stage, share, ended, stuck = math.inf, 2, 0.0, False, ""
-    result: dict[str, Any] | None = None
-
-    def poll(self, recorder: clients.Recorder) -> None:
-        """Take nothing."""
-
-    def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
-        """Return nothing."""
-        return ""
-
-
-_Task: TypeAlias = _Path | _Procedure | _Bare
-
-
 @dataclass
 class _Run:
     """One run of the graph; see `simulate`."""
@@ -365,20 +354,27 @@ class _Run:
     progress: Progress
 
     def write(self, output: Path) -> str:
-        """Run the graph into a bag; return what went wrong, so that the bag stays.
+        """Run the graph into a bag, which stays whatever comes of it; return why a task with a result did not end.
 
         Raises:
             ConfigurationError: the camera's frames are not compressed.
+            GraphError: another task did not end.
+            KeyboardInterrupt: interrupted.
         """
         transport = self.setup.vision.image_transport
         if transport != "compressed":
             expectation = "compressed: the bag must hold what the tracker saw"
             raise ConfigurationError("vision_tracker.image_transport", transport, expectation, str(self.setup.path))
         with whole_folder(output, is_recording=True) as folder:
-            return self.record(folder, output.name)
+            problem = self._record(folder, output.name)
+        if problem is None:
+            raise KeyboardInterrupt
+        if problem and self.task.result is None:
+            raise GraphError(f"{problem}; what was recorded is in {output}")
+        return problem
 
-    def record(self, folder: Path, name: str) -> str:
-        """Run the graph and record it; return what went wrong, so that the bag stays."""
+    def _record(self, folder: Path, name: str) -> str | None:
+        """Run the graph and record it; return what went wrong, empty if nothing did, None if interrupted."""
         setup, task = self.setup, self.task
         arguments = ["--params-file", str(setup.path.resolve()), *live.OWN, *task.arguments]
         arguments += live.arguments_of(changed_parameters(setup.rig, self.believed))
@@ -388,8 +384,8 @@ class _Run:
         notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
         every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *task.recorded)
         recorded = [topic for topic in every if topic is not topics.IMAGE]
-        nodes = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
-        processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
+        rig = (interface.SCENE_SERVER, "rig_simulator")
+        nodes, processes = ", ".join((*rig, *interface.NODES)), (*rig, *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
             bridge = {"coil_bridge:driver": "simulated", "coil_bridge:autostart": "armed"}
             bridge = _wired(ports, len(setup.coils.coil_angles)) if self.boards else bridge
@@ -400,11 +396,11 @@ class _Run:
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
             with live.own_graph(processes, arguments, folder / "logs", nodes, self.log) as graph:
-                sink, clock = _Sink(bag), self.rate is not None
-                with clients.Recorder(graph.domain, recorded, simulated_clock=clock, receive=sink.receive) as recorder:
+                sink = _Sink(bag)
+                with clients.Recorder(graph.domain, recorded, sink.receive, self.rate is not None) as recorder:
                     return self._run(graph, recorder, sink)
 
-    def _run(self, graph: live.OwnGraph, recorder: clients.Recorder, sink: _Sink) -> str:
+    def _run(self, graph: live.OwnGraph, recorder: clients.Recorder, sink: _Sink) -> str | None:
         with graph.interruption:
             _wait(recorder, graph.check, self.log)
         if self.boards and self.task.node:
@@ -421,7 +417,7 @@ class _Run:
             with graph.interruption:
                 return self._steer(recorder, graph.check)
         except KeyboardInterrupt:
-            return INTERRUPTED  # passed on once the bag is whole
+            return None  # passed on once the bag is whole
 
     def _steer(self, recorder: clients.Recorder, check: Callable[[], None]) -> str:
         """Record until the path or procedure is done, or the time is over; return what went wrong."""

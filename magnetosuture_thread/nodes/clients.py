@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -53,6 +53,7 @@ ACTIONS: dict[str, tuple[Service, Any]] = {
 FIND_TIMEOUT = 3.0  # s in which nodes have found each other, on a busy machine too
 CHANGE, SET, GET = "change_state", "set_parameters_atomically", "get_parameters"  # services of a node
 CHANGE_STATE = f"coil_bridge/{CHANGE}"
+Receive: TypeAlias = "Callable[[str, int, bytes], None]"  # called with topic, time of arrival [ns] and CDR bytes
 
 
 class Participant(ExitStack):
@@ -463,22 +464,15 @@ class Recorder(Participant):
     Args:
         domain: the graph's ROS domain.
         recorded: topics to record.
-        simulated_clock: whether the time is that of /clock.
         receive: called with topic, time of arrival [ns] and CDR bytes of every message.
+        simulated_clock: whether the time is that of /clock.
 
     Attributes:
         taken: messages of each topic so far, by its name with a leading slash.
         status_texts: of each node of this package, message and values of its last status.
     """
 
-    def __init__(
-        self,
-        domain: int,
-        recorded: Sequence[topics.Topic],
-        *,
-        simulated_clock: bool,
-        receive: Callable[[str, int, bytes], None],
-    ) -> None:
+    def __init__(self, domain: int, recorded: Sequence[topics.Topic], receive: Receive, simulated_clock: bool) -> None:
         super().__init__("recorder", domain=domain, simulated_clock=simulated_clock)
         self._receive, self._is_simulated = receive, simulated_clock
         self.taken: Counter[str] = Counter()

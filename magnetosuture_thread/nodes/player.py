@@ -17,7 +17,7 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.bags.reading import header_stamp, nanoseconds
 from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import Participant, listen
+from magnetosuture_thread.nodes.clients import Participant, Receive, listen
 from magnetosuture_thread.nodes.executor import Timeline
 from magnetosuture_thread.nodes.node import read_report
 from magnetosuture_thread.settings import interface
@@ -118,7 +118,7 @@ class LiveReplay(Participant):
         bag_start: int,
         played: Collection[topics.Topic],
         nodes: int,
-        receive: Callable[[str, int, bytes], None],
+        receive: Receive,
         watch: Callable[[], None],
         log: Callable[[str], None] = lambda text: None,
     ) -> None:
