@@ -13,20 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from magnetosuture_thread.calibration import commission_files as files
 from magnetosuture_thread.calibration.commission import Commissioning
-from magnetosuture_thread.calibration.commission_files import (
-    PULSES,
-    REPORT_FILE,
-    SETUP_FILE,
-    STOPS_FILE,
-    SUMMARY_FILE,
-    RecordedBench,
-    checked_stops,
-    read_rig,
-    read_stops,
-    values_of,
-    verify_square,
-)
 from magnetosuture_thread.calibration.simulated_bench import SimulatedBench
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
@@ -74,7 +62,7 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
     folder: Path = options.output
     if options.check:
         return _check(options, terminal)
-    if (folder / SUMMARY_FILE).exists():
+    if (folder / files.SUMMARY_FILE).exists():
         raise BagError(folder, "holds a finished commissioning; choose another folder")
     setup = read_setup(options.setup)
     notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8"), "seed": str(options.seed)}
@@ -84,33 +72,33 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
         notes["simulated"] = f"the rig {options.rig or 'of the setup'}, {poses}"
     with _bench(setup, options) as (driven_bench, is_live, check):
         how: dict[str, Any] = {"simulated": not is_live, "poses": notes["rig"], "rig": options.rig or setup.name}
-        stops = folder / STOPS_FILE
-        bench = RecordedBench(driven_bench, folder / PULSES, notes)
-        first = {"check_stops": partial(checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
+        stops = folder / files.STOPS_FILE
+        bench = files.RecordedBench(driven_bench, folder / files.PULSES, notes)
+        first = {"check_stops": partial(files.checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
         radius = setup.scene.dish.radius
         result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check, **first).run()
-        result = verify_square(result, setup, bench)
+        result = files.verify_square(result, setup, bench)
     if bench.reused:
         terminal.log(f"{bench.reused} pulses were there from a run before")
     how["rig_time"] = sum(float(pulse.times[-1] - pulse.on) for pulse in result.pulses)
     if stops.exists():
-        how["stops"] = read_stops(stops)
+        how["stops"] = files.read_stops(stops)
     from magnetosuture_thread.calibration.commission_report import write_results  # late, as it imports matplotlib
 
     summary = write_results(folder, result, setup, how, datetime.date.today().isoformat())
     if result.model is not None:
         rows = [
             (value.name, *_cells(value.value, value.interval, value.before), value.unit, value.kind)
-            for value in values_of(result, setup.coils)
+            for value in files.values_of(result, setup.coils)
         ]
         columns = ("value", "found", "95 % ±", "setup", "unit", "known by")
         title = f"{setup.name} as measured" + (" (simulated)" if how["simulated"] else "")
         terminal.print(command.make_table(title, columns, rows))
     for finding in (*result.findings, *result.failures):
         terminal.log(finding)
-    terminal.log(f"verdict: {summary['verdict']}; {folder / REPORT_FILE}")
+    terminal.log(f"verdict: {summary['verdict']}; {folder / files.REPORT_FILE}")
     if not result.failures:
-        terminal.log(f"setup: {folder / SETUP_FILE}")
+        terminal.log(f"setup: {folder / files.SETUP_FILE}")
     return command.FAILED if result.failures else command.DONE
 
 
@@ -130,7 +118,7 @@ def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, boo
 
 def _check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     setup = read_setup(options.setup)
-    rig = read_rig(options.output, setup.coils)
+    rig = files.read_rig(options.output, setup.coils)
     with _bench(setup, options) as (bench, _, check):
         radius = setup.scene.dish.radius
         commissioning = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check)

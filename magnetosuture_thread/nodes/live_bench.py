@@ -31,19 +31,7 @@ from magnetosuture_thread.calibration.stop_checks import RESTING, TO_REST, TRIES
 from magnetosuture_thread.coils.pulses import IS_OVER, STOOD_STILL
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.needle_arc import heading_angle
-from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import (
-    CHANGE,
-    DISCOVERY_TIME,
-    TIMEOUT,
-    CoilClient,
-    Inbox,
-    Latest,
-    Services,
-    parameters_of,
-    restart,
-    services_to_restart,
-)
+from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.nodes.coil_bridge import PROCESS
 from magnetosuture_thread.nodes.node import read_report
 from magnetosuture_thread.rig.setups import Setup
@@ -60,7 +48,7 @@ FRAMES = 24  # in which a needle's length is measured
 SAME_LENGTH = 1e-3  # of a needle, as a share; less is not worth another start of the nodes
 
 
-class LiveBench(CoilClient):
+class LiveBench(clients.CoilClient):
     """See `Bench` and `StopBench`. While it is open the bridge is armed; at its end all is as it was, and disarmed.
 
     Nodes are changed by their lifecycle and parameters, as by `ros2 lifecycle set` and `ros2 param set`.
@@ -86,11 +74,11 @@ class LiveBench(CoilClient):
         self._poses: list[tuple[float, Vector]] = []  # stamp and pose
         self._texts: dict[str, tuple[str, dict[str, str]]] = {}  # state of each node, and its values
         self._before: dict[str, dict[str, Any]] = {}  # parameters of nodes that were changed
-        kinds = services_to_restart(BRIDGE, TRACKER)
-        self._calls = Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
-        self._measured = Inbox(self.node, topics.NEEDLE_POSE, 1000)
-        self._given = Inbox(self.node, topics.CURRENTS, 1000)
-        self._reports = Inbox(self.node, topics.DIAGNOSTICS, 100)
+        kinds = clients.services_to_restart(BRIDGE, TRACKER)
+        self._calls = clients.Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
+        self._measured = clients.Inbox(self.node, topics.NEEDLE_POSE, 1000)
+        self._given = clients.Inbox(self.node, topics.CURRENTS, 1000)
+        self._reports = clients.Inbox(self.node, topics.DIAGNOSTICS, 100)
         self._commands = topics.NEEDLE_COMMAND.publisher(self.node)
         try:
             self._begin()
@@ -185,7 +173,7 @@ class LiveBench(CoilClient):
             return
         if not any(reason.startswith(cause) for reason in state.reasons for cause in causes):
             raise GraphError(f"coil_bridge: {'; '.join(state.reasons)}")
-        deadline = time.monotonic() + TIMEOUT
+        deadline = time.monotonic() + clients.TIMEOUT
         while True:
             try:
                 self.execute("reset")
@@ -199,7 +187,7 @@ class LiveBench(CoilClient):
     def _begin(self) -> None:
         """Check what has to be, measure the needle, and arm."""
         state = self._wait_for_state()
-        self._wait(DISCOVERY_TIME)
+        self._wait(clients.DISCOVERY_TIME)
         commissioning, self.driver_timeout = self._parameters(BRIDGE, "commissioning", "driver_timeout")
         if not commissioning:
             name, expected = f"{BRIDGE}.commissioning", "true: start the bridge by -p coil_bridge:commissioning:=true"
@@ -229,8 +217,8 @@ class LiveBench(CoilClient):
         """Return the length of the needle by frames of the camera [m]."""
         settings = self._setup.vision
         topic = topics.COMPRESSED_IMAGE if settings.image_transport == "compressed" else topics.IMAGE
-        camera, images = Inbox(self.node, topic, 2), list[Any]()
-        lens = Latest(self.node, topics.CAMERA_INFO, lens_of)
+        camera, images = clients.Inbox(self.node, topic, 2), list[Any]()
+        lens = clients.Latest(self.node, topics.CAMERA_INFO, lens_of)
 
         def look() -> bool:
             lens.poll()
@@ -238,7 +226,7 @@ class LiveBench(CoilClient):
             images.extend(new if lens.value is None else [lens.value.undistorted(image) for image in new])
             return len(images) >= FRAMES
 
-        self.wait_for(look, lambda: GraphError(f"{len(images)} frames of the camera within {TIMEOUT:g} s"))
+        self.wait_for(look, lambda: GraphError(f"{len(images)} frames of the camera within {clients.TIMEOUT:g} s"))
         for inbox in (camera, lens):
             inbox.close()
         return find_needle_length(images, settings, Scene(self._setup.scene.dish))
@@ -268,7 +256,7 @@ class LiveBench(CoilClient):
         Raises:
             GraphError: it is refused for something else, or somebody has stopped or disarmed the bridge.
         """
-        deadline = time.monotonic() + TIMEOUT
+        deadline = time.monotonic() + clients.TIMEOUT
         for _ in self._given.take():
             pass
         while True:
@@ -337,12 +325,12 @@ class LiveBench(CoilClient):
 
     def _ask(self, name: str, request: Any) -> Any:
         """Return the answer of a service, which is called once."""
-        answer = asyncio.run(self._calls.call(name, request, timeout=TIMEOUT, retry_period=math.inf))
+        answer = asyncio.run(self._calls.call(name, request, timeout=clients.TIMEOUT, retry_period=math.inf))
         self._check()
         return answer
 
     def _parameters(self, node: str, *names: str) -> list[Any]:
-        values = asyncio.run(parameters_of(self._calls, node, names))
+        values = asyncio.run(clients.parameters_of(self._calls, node, names))
         self._check()
         return [*values.values()]
 
@@ -353,7 +341,7 @@ class LiveBench(CoilClient):
         self._set(node, values)
 
     def _set(self, node: str, values: Mapping[str, Any]) -> None:
-        is_active = asyncio.run(restart(self._calls, node, values))
+        is_active = asyncio.run(clients.restart(self._calls, node, values))
         self._check()
         if not is_active:
             self._wait(0.2)  # for the reason, on /diagnostics
@@ -378,7 +366,7 @@ class LiveBench(CoilClient):
         Raises:
             GraphError: it was refused.
         """
-        if not self._ask(f"{node}/{CHANGE}", ChangeState.Request(transition=Transition(id=transition))).success:
+        if not self._ask(f"{node}/{clients.CHANGE}", ChangeState.Request(transition=Transition(id=transition))).success:
             self._wait(0.2)  # for the reason, on /diagnostics
             raise GraphError(f"{node}: {self._report(node)[0]}")
 
