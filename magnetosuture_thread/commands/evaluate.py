@@ -246,19 +246,18 @@ def name_of(bag: Path) -> str:
     return name.encode()[:200].decode("utf-8", "ignore")
 
 
-def find_bags(paths: Iterable[Path], depth: int = 2) -> list[Path]:
+def find_bags(paths: Iterable[Path]) -> list[Path]:
     """Return the bags at paths, in their order, each once; within a folder by name.
 
     Args:
-        paths: bags, or folders that hold some.
-        depth: folders below a path in which bags are looked for.
+        paths: bags, or folders that hold some, up to two folders below.
 
     Raises:
         BagError: a path holds none.
     """
     bags: dict[Path, Path] = {}
     for path in paths:
-        inside = _bags(path, depth)
+        inside = _bags(path, 2)
         if not inside:
             raise BagError(path, f"holds no bags ({' or '.join(STORAGE_SUFFIXES)}), nor do the folders in it")
         for bag in inside:

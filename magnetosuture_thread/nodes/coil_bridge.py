@@ -68,12 +68,10 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source), self._step)
-        self.serve(
-            Service.ARM, lambda request, answer: _done(answer, self.arm(request.data)), lambda request: request.data
-        )
-        self.serve(Service.EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
-        self.serve(Service.RESET, lambda _, answer: _done(answer, self.reset()), lambda _: True)
-        self.serve(Service.PULSE, lambda request, answer: _done(answer, self.pulse(request)), lambda _: True)
+        self.serve(Service.ARM, lambda request: self.arm(request.data), lambda request: request.data)
+        self.serve(Service.EMERGENCY_STOP, lambda _: self.stop())
+        self.serve(Service.RESET, lambda _: self.reset(), lambda _: True)
+        self.serve(Service.PULSE, self.pulse, lambda _: True)
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
@@ -292,12 +290,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             logger.info(text)
         else:
             logger.warning(text)
-
-
-def _done(answer: Any, problem: str) -> Any:
-    """Answer that a request was executed, and what is wrong all the same; what refuses one is raised before."""
-    answer.success, answer.message = True, problem
-    return answer
 
 
 def stop_record(node: Node) -> StopRecord:

@@ -65,10 +65,11 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         while not condition():
             self._turn(-1)
 
-    def spin_some(self, max_turns: int = 100) -> None:
-        """Call what is ready, without waiting, until nothing is ready any more, or for so many turns in a flood."""
-        while max_turns and self._turn(0):
-            max_turns -= 1
+    def spin_some(self) -> None:
+        """Call what is ready, without waiting, until nothing is ready any more, or for 100 turns in a flood."""
+        for _ in range(100):
+            if not self._turn(0):
+                return
 
     def _spin_once_impl(self, timeout_sec: Any = None, wait_condition: Callable[[], bool] = lambda: False) -> None:
         seconds = getattr(timeout_sec, "timeout", timeout_sec)
@@ -221,8 +222,8 @@ class Timeline:
         """Whether it is paused."""
         return self._paused is not None
 
-    def on_pause(self, request: Any, answer: Any) -> Any:
-        """Pause the time, or resume it, as a service SetBool."""
+    def on_pause(self, request: Any) -> str:
+        """Pause the time, or resume it, by a request of SetBool; return which."""
         now = time.perf_counter()
         if request.data and self._paused is None:
             self._paused = now
@@ -230,9 +231,7 @@ class Timeline:
             if self._began is not None:
                 self.stood += now - self._paused
             self._paused = None
-        answer.success = True
-        answer.message = f"{'paused' if request.data else 'goes on'} at {self.elapsed():.2f} s"
-        return answer
+        return f"{'paused' if request.data else 'goes on'} at {self.elapsed():.2f} s"
 
     def running(self) -> float:
         """Return for how long it has been running, by real time, since it began [s]."""

@@ -84,8 +84,8 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
             (interface.Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person")),
             (interface.Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person")),
         ):
-            self.serve(service, partial(self._serve, execute))
-        self.serve(interface.Service.RESUME_PROCEDURE, partial(self._serve, self.resume_procedure), lambda _: True)
+            self.serve(service, partial(self._switch, execute))
+        self.serve(interface.Service.RESUME_PROCEDURE, partial(self._switch, self.resume_procedure), lambda _: True)
         self._action = ProcedureAction(self)
         self.every(PERIOD, self.while_active(self.on_timer))
 
@@ -126,14 +126,12 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
         self._session.abort(reason)
         self._publish()
 
-    def on_plan(self, request: Any, answer: Any) -> Any:
-        """Plan a procedure; the plan is published, and nothing moves."""
+    def on_plan(self, request: Any) -> dict[str, float]:
+        """Plan a procedure; the plan is published, and nothing moves. Return the answer's fields."""
         self.require_active()
-        paths = self._plan(request)
-        length = sum(path.length for path in paths)
-        answer.success, answer.length, answer.duration = True, length, self._session.planned_duration
+        length = sum(path.length for path in self._plan(request))
         self._publish()
-        return answer
+        return {"length": length, "duration": self._session.planned_duration}
 
     def on_scene(self, scene: Scene) -> None:
         """Go by another scene; a procedure that does not fit it fails."""
@@ -226,12 +224,11 @@ class NeedlePlannerNode(ManagedNode[session.NeedlePlannerSettings]):
 
         topic.subscribe(self, self.while_active(take), raw=True)
 
-    def _serve(self, execute: Callable[[], bool], request: Any, answer: Any) -> Any:
+    def _switch(self, execute: Callable[[], bool], request: Any) -> dict[str, Any]:
         self.require_active()
-        answer.success = execute()
-        answer.message = "" if answer.success else "no procedure is executed"
+        success = execute()
         self._publish()
-        return answer
+        return {"success": success, "message": "" if success else "no procedure is executed"}
 
     def _plan(self, request: Any) -> tuple[BodyPath, ...]:
         procedure = read_procedure_text(request.procedure)

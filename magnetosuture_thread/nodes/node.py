@@ -241,23 +241,28 @@ class GuardedNode(Node):
     def serve(
         self,
         service: interface.Service,
-        callback: Callable[[Any, Any], Any],
+        execute: Callable[[Any], str | Mapping[str, Any]],
         starts: Callable[[Any], bool] = lambda request: False,
     ) -> None:
-        """Offer a service.
+        """Offer a service, whose answer says whether it succeeded.
 
         Args:
             service: to offer.
-            callback: returns the answer; it may raise.
+            execute: executes a request; returns the message of the answer, or its fields by name. An error that it
+                raises is the answer's reason of a failure.
             starts: whether a request may let the needle move, and is refused where it comes late.
         """
 
-        def in_time(request: Any, answer: Any) -> Any:
+        def respond(request: Any, response: Any) -> Any:
             if starts(request) and offered.sent:  # set by `KeptWaitSetExecutor` alone
                 check_pressed(service, offered.sent * 1e-9, time.time())
-            return callback(request, answer)
+            result = execute(request)
+            fields = {"message": result} if isinstance(result, str) else result
+            for name, value in {"success": True, **fields}.items():
+                setattr(response, name, value)
+            return response
 
-        answer = partial(_answer, self.get_logger(), service, in_time)
+        answer = partial(_answer, self.get_logger(), service, respond)
         offered: Any = self.create_service(topics.ros_class(service.type_name), service, answer)
         offered.sent = 0
 

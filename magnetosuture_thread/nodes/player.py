@@ -264,10 +264,10 @@ class LiveReplay(Participant):
                 self.losses.count_diagnostics(data)
             self._receive(topic.channel.recorded, self._time.now(), data)
 
-    def _on_pause(self, request: Any, answer: Any) -> Any:
-        answer = self._time.on_pause(request, answer)
-        self._log(answer.message)
-        return answer
+    def _on_pause(self, request: Any) -> str:
+        message = self._time.on_pause(request)
+        self._log(message)
+        return message
 
     def _publish_clock(self, simulated: int) -> None:
         self._still, self._last_clock = simulated, time.perf_counter()

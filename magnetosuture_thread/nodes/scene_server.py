@@ -52,19 +52,17 @@ class SceneServerNode(ManagedNode[SceneServerSettings]):
             raise ConfigurationError("scene", "a change of a shape", expectation)
         return self._scene
 
-    def _change(self, change: Callable[[Any], Scene], request: Any, answer: Any) -> Any:
-        """Change the scene, and say what became of it."""
+    def _change(self, change: Callable[[Any], Scene], request: Any) -> dict[str, Any]:
+        """Change the scene; return what became of it."""
         self.require_active()
-        before = self._scene
+        answer, before = dict[str, Any](), self._scene
         try:
             self._scene = change(request)
         except MagnetosutureError as error:
-            answer.success, answer.message = False, str(error)
+            answer |= {"success": False, "message": str(error)}
             self.health.refuse(error)
-        else:
-            answer.success = True
         if self._scene is not None:
-            answer.version = self._scene.version
+            answer["version"] = self._scene.version
             if before is None or before.version != self._scene.version:
                 self._publish(self._scene)
         return answer

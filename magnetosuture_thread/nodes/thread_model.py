@@ -367,8 +367,8 @@ class ThreadForecasts:
             if self._markers.get_subscription_count():
                 self._markers.publish(packed_forecast_markers(stamp, forecast))
 
-    def on_path(self, request: Any, answer: Any) -> Any:
-        """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.
+    def on_path(self, request: Any) -> dict[str, Any]:
+        """Return what happens while the needle's tip follows a path, from the last estimate; nothing moves.
 
         Raises:
             MagnetosutureError: path, speed or horizon are out of bounds, nothing is estimated yet, or the node is not
@@ -388,9 +388,7 @@ class ThreadForecasts:
 
         start, slowed = ForecastStart.of_estimate(result.estimate, pose), settings.friction_feedback == "all"
         forecast = forecaster.forecast(start, command, request.horizon, slowed=slowed)
-        answer.success = True
-        answer.forecast = topics.FORECAST.decode(packed_forecast(result.stamp, forecast))
-        return answer
+        return {"forecast": topics.FORECAST.decode(packed_forecast(result.stamp, forecast))}
 
     def _forecaster(self) -> ThreadForecaster | None:
         """Return the forecaster of the settings and the scene in force; None without a scene."""
