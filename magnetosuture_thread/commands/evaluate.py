@@ -20,13 +20,11 @@ from magnetosuture_thread.commands.track import numbered
 from magnetosuture_thread.evaluation import reference, tables
 from magnetosuture_thread.evaluation.recorded import NOT_FOUND, BagInput, BagSelection, open_bag
 from magnetosuture_thread.evaluation.replay import draw_run, measure_run, picture_or_log, recorded_latency
-from magnetosuture_thread.evaluation.tables import Row
 from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError, one_line
 from magnetosuture_thread.settings.files import is_url, whole_file, whole_folder
-from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -115,7 +113,7 @@ def evaluate_bags(
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
     **selection: Unpack[BagSelection],
-) -> list[Row]:
+) -> list[tables.Row]:
     """Evaluate bags, each for itself.
 
     A bag that cannot be evaluated has its row all the same, with the problem in it, and no picture. What is written
@@ -146,7 +144,7 @@ def evaluate_bags(
     work = partial(
         evaluate_one, against=against, formulation=formulation, selection=selection, is_drawn=output is not None
     )
-    rows: list[Row] = [{} for _ in tasks]
+    rows: list[tables.Row] = [{} for _ in tasks]
     with ExitStack() as stack:
         folder = stack.enter_context(whole_folder(output)) if output is not None else None
         runner = stack.enter_context(TaskRunner(work, workers, scheduler))
@@ -172,7 +170,7 @@ def evaluate_one(
     formulation: str,
     selection: BagSelection,
     is_drawn: bool,
-) -> tuple[Row, bytes]:
+) -> tuple[tables.Row, bytes]:
     """Return the row of a bag and its picture, empty if none is asked for; see `evaluate_bags`.
 
     With a problem in the row there is no picture: nothing stops the others.
@@ -220,7 +218,7 @@ def evaluate_one(
         return _failed(path, name, f"{type(error).__name__}: {error}"), b""
 
 
-def _failed(path: Path, name: str, problem: str) -> Row:
+def _failed(path: Path, name: str, problem: str) -> tables.Row:
     return tables.failed_row(name, one_line(str(path)), one_line(" ".join(problem.split())))
 
 
@@ -259,7 +257,7 @@ def find_bags(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         inside = _bags(path, 2)
         if not inside:
-            raise BagError(path, f"holds no bags ({' or '.join(STORAGE_SUFFIXES)}), nor do the folders in it")
+            raise BagError(path, f"holds no bags ({' or '.join(interface.STORAGE_SUFFIXES)}), nor do the folders in it")
         for bag in inside:
             bags.setdefault(bag.resolve(), bag)
     return list(bags.values())
@@ -277,7 +275,7 @@ def _bags(path: Path, depth: int) -> list[Path]:
         raise BagError(path, f"cannot be read: {error}") from None
     if is_file or any(file.name == METADATA_FILE for file in inside):
         return [path]
-    files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
+    files = [file for file in inside if file.suffix in interface.STORAGE_SUFFIXES and file.is_file()]
     folders = [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
     below = [bag for folder in folders for bag in _bags(folder, depth - 1)]
     if files and not below:

@@ -12,7 +12,6 @@ import numpy as np
 
 from magnetosuture_thread import ConfigurationError, Disc
 from magnetosuture_thread.bags import packing
-from magnetosuture_thread.bags.packing import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory, read_reference
@@ -115,7 +114,7 @@ def render_bag(
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
         bag.add_topic(interface.SCENE.recorded, interface.SCENE.type_name)
         begin = round((start + EPOCH) * 1e9)
-        bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
+        bag.write(interface.SCENE.recorded, begin, packing.packed_scene(begin, setup.scene))
         for index in range(frames):
             time = start + index / rate
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)

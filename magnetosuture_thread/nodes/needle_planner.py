@@ -14,7 +14,6 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs import msg
 from magnetosuture_msgs.action import ExecuteProcedure
-from magnetosuture_msgs.msg import ProcedureState as StateMessage
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 from std_msgs.msg import Header
@@ -301,12 +300,12 @@ def _vertices(message: Any) -> Points | None:
     return vertices if len(vertices) >= 2 and np.isfinite(vertices).all() else None
 
 
-def state_message(stamp: Any, status: session.ProcedureStatus) -> StateMessage:
+def state_message(stamp: Any, status: session.ProcedureStatus) -> msg.ProcedureState:
     """Return the state of a procedure as a message, whose fields have the names of its own."""
-    state = getattr(StateMessage, f"STATE_{'IDLE' if status.state is None else status.state.name}")
+    state = getattr(msg.ProcedureState, f"STATE_{'IDLE' if status.state is None else status.state.name}")
     fields = {**vars(status), "state": state, "goals": list(status.goals), "procedure": shortened(status.procedure)}
     fields["reason"] = shortened(status.reason, MAX_REASON_CHARS)
-    return StateMessage(header=Header(stamp=stamp, frame_id=interface.DISH_FRAME), **fields)
+    return msg.ProcedureState(header=Header(stamp=stamp, frame_id=interface.DISH_FRAME), **fields)
 
 
 class ProcedureAction:
@@ -331,12 +330,12 @@ class ProcedureAction:
         except Exception as error:  # it would come out of `spin`
             self._node.refuse(error)
             goal.abort()
-            return ExecuteProcedure.Result(state=StateMessage.STATE_FAILED, reason=reason_of(error))
+            return ExecuteProcedure.Result(state=msg.ProcedureState.STATE_FAILED, reason=reason_of(error))
         self._goal, self._end = goal, Future()
         status = await self._end
         if goal.is_cancel_requested:
             goal.canceled()
-        elif status.state == StateMessage.STATE_FAILED:
+        elif status.state == msg.ProcedureState.STATE_FAILED:
             goal.abort()
         else:
             goal.succeed()
@@ -349,11 +348,11 @@ class ProcedureAction:
         self._node.abort("cancelled by the client of the action")
         return CancelResponse.ACCEPT
 
-    def update(self, status: StateMessage) -> None:
+    def update(self, status: msg.ProcedureState) -> None:
         """Take the state of the procedure: feedback of the goal, or its end."""
         if self._goal is None or self._end.done():
             return
-        if status.state in (StateMessage.STATE_DONE, StateMessage.STATE_FAILED):
+        if status.state in (msg.ProcedureState.STATE_DONE, msg.ProcedureState.STATE_FAILED):
             self._end.set_result(status)
         else:
             self._goal.publish_feedback(ExecuteProcedure.Feedback(status=status))

@@ -30,7 +30,6 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.executor import KeptWaitSetExecutor
@@ -594,13 +593,8 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
 
     def _entities(self) -> dict[Any, Callable[[Any], object]]:
         """Return what the node has in the graph, and what takes each out of it."""
-        kinds: tuple[tuple[Iterator[Any], Callable[[Any], object]], ...] = (
-            (self.publishers, self.destroy_publisher),
-            (self.subscriptions, self.destroy_subscription),
-            (self.services, self.destroy_service),
-            (self.timers, self.destroy_timer),
-        )
-        return {entity: destroy for entities, destroy in kinds for entity in entities}
+        kinds = ("publisher", "subscription", "service", "timer")
+        return {entity: getattr(self, f"destroy_{kind}") for kind in kinds for entity in getattr(self, f"{kind}s")}
 
     def _release_all(self) -> None:
         try:
@@ -713,7 +707,7 @@ class SceneFollower:
         """Handle the bytes of a published scene."""
         self._heard = None
         try:
-            self._heard = scene = parse_scene_message(topics.SCENE.decode(data))
+            self._heard = scene = reading.parse_scene_message(topics.SCENE.decode(data))
             if self._node.is_configured and scene.version != self.version:
                 self._changed(scene)
         except MagnetosutureError as error:

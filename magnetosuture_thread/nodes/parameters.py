@@ -25,27 +25,13 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.settings.configuration import (
-    ROS_PARAMETERS,
-    Configuration,
-    ConfigurationField,
-    configuration_fields,
-    from_mapping,
-    parse_parameter_value,
-    suggest_names,
-)
-from magnetosuture_thread.settings.shared_parameters import (
-    EVERY_NODE,
-    SHARED_PARAMETERS,
-    key_matches,
-    names_of,
-    read_sections,
-)
+from magnetosuture_thread.settings import configuration
+from magnetosuture_thread.settings import shared_parameters as shared
+from magnetosuture_thread.settings.configuration import Configuration, ConfigurationField, from_mapping
 
 C = TypeVar("C", bound=Configuration)
 
 _ARGUMENTS: WeakKeyDictionary[Context, list[str]] = WeakKeyDictionary()  # of each context, where it is known
-_TYPES = {bool: "BOOL", int: "INTEGER", float: "DOUBLE", str: "STRING"}  # names of `Parameter.Type`
 
 
 def init(arguments: Sequence[str] | None = None, context: Context | None = None, **options: Any) -> None:
@@ -63,7 +49,7 @@ def init(arguments: Sequence[str] | None = None, context: Context | None = None,
     line = list(sys.argv if arguments is None else arguments)
     for flag, value in _flags(line):
         if flag == "--params-file":
-            read_sections(Path(value))
+            shared.read_sections(Path(value))
     context = context or get_default_context()
     start_ros(context, args=line, **options)
     _ARGUMENTS[context] = line
@@ -103,9 +89,9 @@ def declare(node: Node, cls: type[C], options: Mapping[str, Any], fixed: Mapping
     values = _parameters(cls.GROUP, node.get_fully_qualified_name(), options)
     if isinstance(clock := values.get("use_sim_time"), bool):
         node.set_parameters([Parameter("use_sim_time", value=clock)])
-    others = {*SHARED_PARAMETERS, *ROS_PARAMETERS} - names_of(cls)
+    others = {*shared.SHARED_PARAMETERS, *configuration.ROS_PARAMETERS} - shared.names_of(cls)
     settings = from_mapping(cls, {name: value for name, value in values.items() if name.split(".")[0] not in others})
-    fields = configuration_fields(cls)
+    fields = configuration.configuration_fields(cls)
     for setting in fields:  # by their types: by its value rclpy would take an empty list for one of bytes, for good
         node.declare_parameter(setting.name, _type(setting), ignore_override=True)
     node.set_parameters_atomically([_parameter(setting, getattr(settings, setting.name)) for setting in fields])
@@ -129,10 +115,10 @@ def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
     Raises:
         ConfigurationError: a value is invalid.
     """
-    overrides = [item for item in options.get("parameter_overrides") or [] if item.name in SHARED_PARAMETERS]
+    overrides = [item for item in options.get("parameter_overrides") or [] if item.name in shared.SHARED_PARAMETERS]
     name = f"{node.get_fully_qualified_name().rpartition('/')[0]}/{cls.GROUP}"
     values = _parameters(cls.GROUP, name, {**options, "parameter_overrides": overrides}, is_required=False)
-    return from_mapping(cls, {name: values[name] for name in values.keys() & names_of(cls)})
+    return from_mapping(cls, {name: values[name] for name in values.keys() & shared.names_of(cls)})
 
 
 def _parameters(kind: str, node: str, options: Mapping[str, Any], *, is_required: bool = True) -> dict[str, Any]:
@@ -152,7 +138,7 @@ def _parameters(kind: str, node: str, options: Mapping[str, Any], *, is_required
             left, _, right = value.partition(":=")
             owner, _, name = left.rpartition(":")
             if owner in ("", kind, node.rpartition("/")[2]):
-                values[name] = parse_parameter_value(right)
+                values[name] = configuration.parse_parameter_value(right)
     return values | {override.name: plain_value(override) for override in options.get("parameter_overrides") or []}
 
 
@@ -168,12 +154,13 @@ def _flags(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 def _sections_for(path: Path, kind: str, node: str, is_required: bool) -> list[dict[str, Any]]:
     """Return the sections of a file that are for a node, by its own name or the one that it was given."""
-    sections, (space, _, name) = read_sections(path), node.rpartition("/")
-    fitting = {key for key, _ in sections if key_matches(key, node) or key_matches(key, f"{space}/{kind}")}
+    sections, (space, _, name) = shared.read_sections(path), node.rpartition("/")
+    names, every = (node, f"{space}/{kind}"), shared.EVERY_NODE
+    fitting = {key for key, _ in sections if any(shared.key_matches(key, name) for name in names)}
     of_kind = {key for key, _ in sections if key.rpartition("/")[2] in (kind, name)}
     # A section of its kind that is for another namespace only is as bad as none: the rest would be its defaults.
     if is_required and (not fitting or (of_kind and not fitting & of_kind)):
-        expected = f"one for {node}: {EVERY_NODE}/{kind} or {node}" + ("" if of_kind else f" or {EVERY_NODE}")
+        expected = f"one for {node}: {every}/{kind} or {node}" + ("" if of_kind else f" or {every}")
         keys = ", ".join(key for key, _ in sections) or "none"
         raise ConfigurationError("sections", keys, expected, str(path))
     return [values for key, values in sections if key in fitting]
@@ -197,8 +184,7 @@ def _descriptor(setting: ConfigurationField, fixed: Mapping[str, str] | None) ->
 
 
 def _type(setting: ConfigurationField) -> Parameter.Type:
-    is_list = setting.kind is tuple
-    return Parameter.Type[_TYPES[setting.entry if is_list else setting.kind] + "_ARRAY" * is_list]
+    return Parameter.Type.from_parameter_value([setting.entry()] if setting.kind is tuple else setting.kind())
 
 
 def _parameter(setting: ConfigurationField, value: Any) -> Parameter:
@@ -215,17 +201,18 @@ def _as_declared(node: Any, cls: type[Configuration], parameters: Sequence[Param
         ParameterNotDeclaredException: an unknown name. The services of rclpy answer its text; by itself rclpy forgets
             the name.
     """
-    fields = {setting.name: setting for setting in configuration_fields(cls)}
+    fields = {setting.name: setting for setting in configuration.configuration_fields(cls)}
     converted = []
     for parameter in parameters:
         name, value, setting = parameter.name, plain_value(parameter), fields.get(parameter.name)
         if setting is None and not (name and node.has_parameter(name)):
-            expected = suggest_names(name, list(fields))
+            expected = configuration.suggest_names(name, list(fields))
             raise ParameterNotDeclaredException(str(ConfigurationError(f"{cls.GROUP}.{name}", value, expected)))
         if setting is not None and value is not None:
-            text = isinstance(value, str) and setting.kind is float
+            if isinstance(value, str) and setting.kind is float:
+                value = configuration.parse_parameter_value(value)
             with suppress(ConfigurationError):
-                parameter = _parameter(setting, setting.checked(parse_parameter_value(value) if text else value))
+                parameter = _parameter(setting, setting.checked(value))
         converted.append(parameter)
     return converted
 
