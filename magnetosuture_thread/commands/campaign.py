@@ -32,8 +32,6 @@ from magnetosuture_thread.settings.files import whole_folder
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MAX_PANELS = 12  # failed runs that are drawn; the figures of all are in the table
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -190,7 +188,7 @@ def draw_campaign(result: CampaignResult) -> bytes:
     """
     from magnetosuture_thread.evaluation import plots  # late, as it imports matplotlib
 
-    failed = [outcome for outcome in result.runs if not outcome.success][:MAX_PANELS]
+    failed = [outcome for outcome in result.runs if not outcome.success][:12]  # the figures of all are in the table
     rows = -(-len(failed) // 4)
     height = 3.3 + 3.6 * rows
     figure = plots.make_figure(14.0, height)

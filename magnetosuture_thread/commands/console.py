@@ -22,7 +22,7 @@ from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.calibration.commission_files import SUMMARY_FILE
 from magnetosuture_thread.commands import command, live
-from magnetosuture_thread.commands.measurement import DONE, FAILED, RUNNING, TEACH, Measurement, taught_values
+from magnetosuture_thread.commands.measurement import Measurement, taught_values
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.evaluation.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
@@ -39,8 +39,6 @@ from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, S
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
 TRACKER = "vision_tracker"
-TAUGHT_TIME = 1.0  # s of frames, in the first of which the needle is marked
-SAME_DISH = 1e-5  # m; two dishes differ by more
 SAME_LENGTH = 0.02  # of a needle, as a share; as far as marks tell, and less than keep_out of every setup
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
@@ -248,7 +246,7 @@ class RecordingHost(GraphHost):
 
     def at_work(self) -> str:
         """Return what has to end before anything else begins; empty if nothing has to."""
-        if self._measurement is not None and self._measurement.state == RUNNING:
+        if self._measurement is not None and self._measurement.state == "running":
             return f"{self._measurement.name} is running; cancel it first"
         return self.busy
 
@@ -279,20 +277,20 @@ class RecordingHost(GraphHost):
         if not self._measures:
             return "nobody said which setup this graph has: `magnetosuture console SETUP --graph`"
         believed, scene = self.setup.scene.dish.diameter, self.graph.state()["scene"] or {}
-        if abs(scene.get("dish_diameter", believed) - believed) > SAME_DISH:
+        if abs(scene.get("dish_diameter", believed) - believed) > 1e-5:  # m; two dishes differ by more
             return (
                 f"the graph's dish of {1e3 * scene['dish_diameter']:g} mm is not the setup's of {1e3 * believed:g} mm"
             )
         if self._is_armed():
             return "the coils are armed; disarm first"
         measurement = self._measurement = Measurement(action)
-        run = self._teach(measurement, marks) if action == TEACH else self._commission(measurement)
+        run = self._teach(measurement, marks) if action == "teach" else self._commission(measurement)
         self._measuring = asyncio.create_task(_ended(measurement, run))
         return ""
 
     def cancel(self) -> None:
         """End the measurement that runs, if there is one."""
-        if self._measurement is not None and self._measurement.state == RUNNING:
+        if self._measurement is not None and self._measurement.state == "running":
             self._measurement.cancel()
 
     def picture(self) -> bytes:
@@ -329,7 +327,7 @@ class RecordingHost(GraphHost):
         camera = [topics.IMAGE if raw else topics.COMPRESSED_IMAGE, topics.CAMERA_INFO]
         bag = BagRecording(folder / "frames", {"setup": self.setup.name}, self.graph, camera)
         await bag.begin()
-        await asyncio.sleep(TAUGHT_TIME)
+        await asyncio.sleep(1.0)  # s of frames, in the first of which the needle is marked
         await bag.end()
         tail, tip = ([f"{value:.2f}" for value in mark] for mark in (marks[:2], marks[2:]))
         arguments = [str(bag.output), "--tail", *tail, "--tip", *tip, "--setup", str(self.setup.path)]
@@ -397,7 +395,7 @@ async def _ended(measurement: Measurement, run: Coroutine[Any, Any, str]) -> Non
     except Exception as error:  # whatever it is, the page goes on
         problem = str(error) if isinstance(error, (MagnetosutureError, OSError)) else f"internal error: {error!r}"
     measurement.lines += [problem] if problem else []
-    measurement.state = FAILED if problem else DONE
+    measurement.state = "failed" if problem else "done"
 
 
 class SimulatedHost(RecordingHost):

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -23,11 +23,9 @@ from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, shortened
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-TEACH = "teach"
 # How a needle looks, which a tracker that runs is told. Its length stays, as the bridge keeps that needle off shapes;
 # so does its view, with the check that the dish is where it was.
 TAUGHT = ("needle_width", "max_needle_brightness", "needle_colour", "needle_is_blunt", "max_needle_bend")
-RUNNING, DONE, FAILED = "running", "done", "failed"
 MAX_LINES = 40  # that a page is sent
 END_TIMEOUT = 20.0  # s for a command to end by itself, once it is cancelled: it starts nodes anew as they were
 
@@ -41,13 +39,14 @@ class Measurement:
     Attributes:
         name: as given.
         lines: the latest that it has printed.
-        state: `RUNNING`, `DONE` or `FAILED`.
+        state: whether it runs, is done or has failed.
         picture: name and bytes of a PNG file that came of it; empty without one.
         cancelled: whether it is to end.
     """
 
     def __init__(self, name: str) -> None:
-        self.name, self.state, self.cancelled = name, RUNNING, False
+        self.name, self.cancelled = name, False
+        self.state: Literal["running", "done", "failed"] = "running"
         self.picture = ("", b"")
         self._cancelled_at = math.inf  # monotonic [s]
         self.lines: deque[str] = deque(maxlen=MAX_LINES)

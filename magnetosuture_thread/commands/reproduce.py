@@ -27,8 +27,6 @@ from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.interface import COMPRESSED_IMAGE
 
-SHOWN = 4  # instants of each run
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Reproduce a result of the paper, simulated."""
@@ -152,8 +150,8 @@ def thread_behavior(
             summary, instants = collector.summary(setup.name), collector.instants
             if not instants:
                 raise BagError(path, "holds no predicted thread")
-            # Spread evenly over the run, the last instant among them.
-            at = np.linspace(0, len(instants) - 1, SHOWN + 1).round().astype(int)[1:]
+            # Four are shown, spread evenly over the run, the last instant among them.
+            at = np.linspace(0, len(instants) - 1, 5).round().astype(int)[1:]
             stamps = {instants[index].stamp for index in at}
             records = bag.records({COMPRESSED_IMAGE.recorded})
             images = {stamp: read_image(record) for record in records if (stamp := stamp_of(record)) in stamps}

@@ -23,7 +23,6 @@ MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they
 MAX_NEW_WATCHERS = 20  # from one address in a second
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
 
-PICTURE = "/measurement.png"  # of what the page has measured last
 
 Responder = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 HEADERS = {
@@ -118,7 +117,7 @@ class ConsoleServer:
                 return await self._connect(request)
             except web.HTTPBadRequest as error:  # no WebSocket
                 return _answer(error.status, error.text or "")
-        if request.path == PICTURE and (picture := self._host.picture()):
+        if request.path == "/measurement.png" and (picture := self._host.picture()):  # of what was measured last
             return web.Response(body=picture, content_type="image/png", headers=HEADERS)
         if request.path not in self._files:
             return _answer(404, "there is no such file")

@@ -50,9 +50,7 @@ ACTIONS: dict[str, tuple[Service, Any]] = {
     "reset": (Service.RESET, Trigger.Request()),
 }
 """What switches the coil bridge: service and request."""
-FIND_TIMEOUT = 3.0  # s in which nodes have found each other, on a busy machine too
 CHANGE, SET, GET = "change_state", "set_parameters_atomically", "get_parameters"  # services of a node
-CHANGE_STATE = f"coil_bridge/{CHANGE}"
 Receive: TypeAlias = "Callable[[str, int, bytes], None]"  # called with topic, time of arrival [ns] and CDR bytes
 
 
@@ -313,7 +311,7 @@ class CoilClient(Participant):
     def __init__(self, namespace: str = "") -> None:
         super().__init__("coil_client", namespace=namespace)
         kinds: dict[str, str] = {service: service.type_name for service, _ in ACTIONS.values()}
-        self._services = Services(self.node, {**kinds, CHANGE_STATE: "lifecycle_msgs/srv/ChangeState"})
+        self._services = Services(self.node, {**kinds, f"coil_bridge/{CHANGE}": "lifecycle_msgs/srv/ChangeState"})
         self._state = Latest(self.node, topics.BRIDGE_STATE)
 
     def execute(self, action: str) -> str:
@@ -327,7 +325,8 @@ class CoilClient(Participant):
         """
         message = ""
         if action in ACTIONS:
-            answer = self._call(*ACTIONS[action], call_within=FIND_TIMEOUT if action in STARTS else math.inf)
+            # In 3 s nodes have found each other, on a busy machine too.
+            answer = self._call(*ACTIONS[action], call_within=3.0 if action in STARTS else math.inf)
             message = shortened(answer.message, MAX_REASON_CHARS)
             if not answer.success:
                 raise GraphError(message)
@@ -337,7 +336,7 @@ class CoilClient(Participant):
             time.sleep(DISCOVERY_TIME)
             transition = Transition(id=getattr(Transition, f"TRANSITION_{action.upper()}"))
             request = ChangeState.Request(transition=transition)
-            if not self._call(CHANGE_STATE, request, retry_period=math.inf).success:
+            if not self._call(f"coil_bridge/{CHANGE}", request, retry_period=math.inf).success:
                 raise GraphError(f"the bridge rejected {action}: not possible in its state, or see its log")
         time.sleep(0.15)  # for the bridge to publish its new state
         return message

@@ -33,7 +33,6 @@ from magnetosuture_thread.settings.interface import Service
 # Keys of the report on /diagnostics.
 PROCESS = "process"
 JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
-AGED = (*INPUTS.values(), topics.NEEDLE_POSE.name)  # inputs whose least age is reported
 
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
@@ -249,10 +248,11 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if output is not None and not output.publish:
             self._filter.publish(packing.packed_filter_state(stamp, output))
         # Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
+        aged = (*INPUTS.values(), topics.NEEDLE_POSE.name)
         ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
         self.health.note(
             **{key: round(value, 3) for key, value in zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)},
-            **{f"minimum age of {name} [ms]": round(1e3 * ages.get(name, math.nan), 1) for name in AGED},
+            **{f"minimum age of {name} [ms]": round(1e3 * ages.get(name, math.nan), 1) for name in aged},
             **{"driver": system.driver_name, "scene": scene or "none", "driver problem": driver.problem or "none"},
         )
         self._log(closed or latch.state.value, driver)

@@ -15,8 +15,6 @@ from rclpy.node import Node
 from rclpy.task import Task
 from rclpy.waitable import NumberOfEntities
 
-EVENT_PERIOD = 1.0  # s between two looks at events, as that a publisher of another quality of service was found
-
 
 class KeptWaitSetExecutor(SingleThreadedExecutor):
     """Calls what is ready as rclpy's executor of one thread does, at less than half of its cost.
@@ -95,7 +93,7 @@ class KeptWaitSetExecutor(SingleThreadedExecutor):
         waitables = [waitable for waitable in self._waitables if with_events or not isinstance(waitable, EventHandler)]
         for waitable in waitables:
             waitable.add_to_wait_set(self._wait_set)
-        self._events_due = now + EVENT_PERIOD if with_events else self._events_due
+        self._events_due = now + 1.0 if with_events else self._events_due
         self._wait_set.wait(0 if resumed else nanoseconds)
         if not self._context.ok():
             raise ExternalShutdownException()

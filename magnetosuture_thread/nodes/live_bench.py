@@ -343,9 +343,7 @@ class LiveBench(clients.CoilClient):
     def _set(self, node: str, values: Mapping[str, Any]) -> None:
         is_active = asyncio.run(clients.restart(self._calls, node, values))
         self._check()
-        if not is_active:
-            self._wait(0.2)  # for the reason, on /diagnostics
-            raise GraphError(f"{node}: {self._report(node)[0]}")
+        self._require(is_active, node)
         if node == BRIDGE:
             self._await_driver()
 
@@ -366,7 +364,12 @@ class LiveBench(clients.CoilClient):
         Raises:
             GraphError: it was refused.
         """
-        if not self._ask(f"{node}/{clients.CHANGE}", ChangeState.Request(transition=Transition(id=transition))).success:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        self._require(self._ask(f"{node}/{clients.CHANGE}", request).success, node)
+
+    def _require(self, success: bool, node: str) -> None:
+        """Raise a `GraphError` with what a node reports of itself where it has refused something."""
+        if not success:
             self._wait(0.2)  # for the reason, on /diagnostics
             raise GraphError(f"{node}: {self._report(node)[0]}")
 

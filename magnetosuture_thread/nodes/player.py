@@ -29,7 +29,6 @@ START_TIMEOUT = 180.0  # s for all nodes to be there
 # starts and then each 3 s, and on a busy machine the first of these get lost.
 SETTLE = 3.2
 QUIET = 0.5  # s without any answer, once all has been taken and answered: the graph is done
-STUCK = 3.0  # s without any answer where poses are left: the model refuses them, or they got lost
 DEPTH = 300  # messages that may wait for a slow node before any is lost
 Recorded: TypeAlias = Any  # a recorded message: `topic`, `time` [ns] and `data` (CDR bytes)
 
@@ -221,7 +220,8 @@ class LiveReplay(Participant):
         deadline = self._time.running() + 30.0
         self._last_answer = time.perf_counter()
         while self._time.running() < deadline:
-            enough, losses = STUCK if self.losses.unanswered else QUIET, self.losses
+            losses = self.losses
+            enough = 3.0 if losses.unanswered else QUIET  # s; poses that are left the model refuses, or they got lost
             if losses.frames_taken >= losses.frames_played and time.perf_counter() > self._last_answer + enough:
                 break
             clock = self._run_clock(clock, clock + CLOCK_PERIOD)

@@ -19,25 +19,22 @@ from typing import Any
 
 from magnetosuture_thread.settings.errors import GraphError
 
-# Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
-LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
-
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LIBC = ctypes.CDLL(None)  # loaded here, and not between fork and exec
-
-# What could lead a graph out of this machine or to another graph.
-LEADS_ELSEWHERE = (
-    *("CYCLONEDDS_URI", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_DISCOVERY_SERVER"),
-    *("ROS_NAMESPACE", "ROS_STATIC_PEERS", "ROS_SUPER_CLIENT"),
-)
 
 
 def graph_environment(domain: int) -> dict[str, str]:
     """Return the environment for a graph of its own on this machine alone."""
-    environment = {key: value for key, value in os.environ.items() if key not in LEADS_ELSEWHERE}
+    leads_elsewhere = (  # out of this machine, or to another graph
+        *("CYCLONEDDS_URI", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_DISCOVERY_SERVER"),
+        *("ROS_NAMESPACE", "ROS_STATIC_PEERS", "ROS_SUPER_CLIENT"),
+    )
+    environment = {key: value for key, value in os.environ.items() if key not in leads_elsewhere}
     environment["ROS_DOMAIN_ID"] = str(domain)
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    environment.setdefault("FASTDDS_BUILTIN_TRANSPORTS", LARGE_DATA)
+    # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
+    large_data = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
+    environment.setdefault("FASTDDS_BUILTIN_TRANSPORTS", large_data)
     environment["PYTHONSAFEPATH"] = "1"  # not the package of a clone that a person is in; from 3.11 on
     return environment
 
