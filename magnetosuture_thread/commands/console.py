@@ -34,7 +34,7 @@ from magnetosuture_thread.nodes.processes import STOPS, NodeProcesses
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError
-from magnetosuture_thread.settings.files import share_directory, whole_folder
+from magnetosuture_thread.settings.files import shipped_names, whole_folder
 from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
@@ -413,8 +413,8 @@ class SimulatedHost(RecordingHost):
 
     def __init__(self, graph: ConsoleGraph, setup: str, logs: Path, recordings: Path, log: Log) -> None:
         super().__init__(graph, read_setup(setup), recordings, log)
-        shipped = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
-        self._setup_name, self._setups, self._logs = setup, list(dict.fromkeys([*shipped, setup])), logs
+        self._setups = list(dict.fromkeys([*shipped_names("setup"), setup]))
+        self._setup_name, self._logs = setup, logs
         self._nodes: NodeProcesses | None = None
         self._since, self._logged = 0.0, set[str]()
         self._block(f"starting {self.setup.name}")

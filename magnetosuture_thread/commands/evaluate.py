@@ -81,19 +81,17 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
             raise ConfigurationError(f"--{name}", str(value), f"nothing: it is only {why}")
     if options.json is not None:
         tables.check_table(options.json)
-    if is_bags:
-        names = ("paths", "output", "against", "formulation", "workers", "scheduler")
-        selection = {**command.given(options, *names), **command.bag_selection(options)}
-        with terminal.progress("evaluate") as advance:
+    with terminal.progress("evaluate") as advance:
+        if is_bags:
+            names = ("paths", "output", "against", "formulation", "workers", "scheduler")
+            selection = {**command.given(options, *names), **command.bag_selection(options)}
             rows = evaluate_bags(**selection, log=terminal.log, progress=advance)
-        document = tables.bags_document(rows)
-        terminal.print(bags_table(rows))
-    else:
-        with terminal.progress("evaluate") as advance:
+            document, table = tables.bags_document(rows), bags_table(rows)
+        else:
             evaluation = evaluate_references(options, terminal.log, advance)
-        document = evaluation.to_mapping()
-        rows = document["cases"]
-        terminal.print(references_table(evaluation))
+            document, table = evaluation.to_mapping(), references_table(evaluation)
+            rows = document["cases"]
+    terminal.print(table)
     if options.json is not None:
         with whole_file(options.json) as file:
             tables.write_table(file, rows, document)

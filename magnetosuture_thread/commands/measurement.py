@@ -15,12 +15,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from magnetosuture_thread.nodes.processes import end_with_parent
 from magnetosuture_thread.settings.configuration import to_mapping
 from magnetosuture_thread.settings.errors import MAX_REASON_CHARS, shortened
-from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
+from magnetosuture_thread.settings.shared_parameters import read_sections
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 # How a needle looks, which a tracker that runs is told. Its length stays, as the bridge keeps that needle off shapes;
@@ -107,8 +105,8 @@ def taught_values(path: Path) -> tuple[float, dict[str, Any]]:
     """Return the needle's length that `teach` has written [m], and `TAUGHT`, the usual values where it leaves them out.
 
     Raises:
-        OSError: the file cannot be read.
+        ConfigurationError: the file cannot be read.
     """
-    usual, sections = to_mapping(VisionTrackerSettings()), yaml.safe_load(read_regular(path, MAX_TEXT_BYTES))
-    written = {name: value for section in sections.values() for name, value in section["ros__parameters"].items()}
+    usual = to_mapping(VisionTrackerSettings())
+    written = {name: value for _, section in read_sections(path) for name, value in section.items()}
     return float(written["needle_length"]), {name: written.get(name, usual[name]) for name in TAUGHT}

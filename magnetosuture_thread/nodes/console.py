@@ -350,8 +350,7 @@ def tracker(message: msg.TrackerState) -> dict[str, Any]:
     view, scale = None, message.metres_per_pixel
     if len(message.dish_centre) == 2 and scale > 0.0:
         view = {"centre": list(message.dish_centre), "scale": scale, "rotation": message.camera_rotation}
-    state = constant_name(message, message.state, "STATE_", "searching")
-    return {"state": state, **_plain(message, "reason confidence"), "view": view}
+    return {**_plain(message, "state reason confidence", "searching"), "view": view}
 
 
 def measured_thread(message: Path) -> list[list[float]]:
@@ -481,21 +480,16 @@ def filter_state(message: msg.FilterState) -> dict[str, Any]:
 
 def bridge(message: msg.CoilBridgeState) -> dict[str, Any]:
     """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
-    state = constant_name(message, message.state, "STATE_", "fault")
-    motion = "armed emergency_stopped reasons commanded filtered applied saturated"
-    return {
-        "state": state,
-        **_plain(message, motion),
-        **_plain(message, "driver driver_ready driver_warnings current measured_current refused"),
-    }
+    motion = "state armed emergency_stopped reasons commanded filtered applied saturated"
+    driver = "driver driver_ready driver_warnings current measured_current refused"
+    return _plain(message, f"{motion} {driver}", "fault")
 
 
 def procedure(message: msg.ProcedureState) -> dict[str, Any]:
     """Return what the needle planner does."""
     return {
-        "state": constant_name(message, message.state, "STATE_", "failed"),
         "name": shortened(message.procedure),
-        **_plain(message, "goals goal goals_met progress resumes hold_to_run"),
+        **_plain(message, "state goals goal goals_met progress resumes hold_to_run", "failed"),
         "reason": shortened(message.reason, MAX_REASON_CHARS),
         "clearance": message.clearance if np.isfinite(message.clearance) else None,
     }
@@ -517,8 +511,11 @@ def node_state(status: DiagnosticStatus) -> dict[str, Any]:
     }
 
 
-def _plain(message: Any, names: str) -> dict[str, Any]:
-    """Return fields of a message, by their names, as plain values: texts and lists shortened, vectors in the plane."""
+def _plain(message: Any, names: str, unknown: str = "") -> dict[str, Any]:
+    """Return fields of a message, by their names, as plain values: texts and lists shortened, vectors in the plane.
+
+    A `state` becomes the name of its constant, or `unknown` where it has none.
+    """
 
     def plain(value: Any) -> Any:
         if isinstance(value, str):
@@ -527,7 +524,8 @@ def _plain(message: Any, names: str) -> dict[str, Any]:
             return [value.x, value.y]
         return value if isinstance(value, (bool, int, float)) else [plain(entry) for entry in value[:MAX_LISTED]]
 
-    return {name: plain(getattr(message, name)) for name in names.split()}
+    fields = {name: plain(getattr(message, name)) for name in names.split()}
+    return fields | ({"state": constant_name(message, message.state, "STATE_", unknown)} if unknown else {})
 
 
 def _points(positions: Any) -> list[list[float]]:
