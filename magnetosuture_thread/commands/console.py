@@ -39,7 +39,6 @@ from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, S
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
 TRACKER = "vision_tracker"
-SAME_LENGTH = 0.02  # of a needle, as a share; as far as marks tell, and less than keep_out of every setup
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
@@ -337,7 +336,7 @@ class RecordingHost(GraphHost):
         if not is_taught or measurement.cancelled or self._is_armed():
             return "not given to the tracker: the coils are armed" if is_taught and self._is_armed() else "not taught"
         (length, values), believed = taught_values(output), self.setup.vision.needle_length
-        if abs(length / believed - 1.0) > SAME_LENGTH:
+        if abs(length / believed - 1.0) > 0.02:  # as far as marks tell, and less than keep_out of every setup
             sizes = f"the needle is {1e3 * length:.2f} mm long, and {1e3 * believed:.2f} mm in the setup"
             return f"{sizes}: copy the parameters into it, and start its nodes anew"
         if problem := await self._change_tracker(values):

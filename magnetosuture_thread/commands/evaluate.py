@@ -29,8 +29,6 @@ from magnetosuture_thread.settings.files import is_url, whole_file, whole_folder
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-BAG_OPTIONS = ("setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
-REFERENCE_OPTIONS = ("solver", "segments", "rig")
 MARKS = {"simulated": "* simulated", "unverified": "? unverified", "silences": "! frames are missing"}  # by column
 
 
@@ -74,7 +72,8 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
     Errors are mean distances of the nodes in % of the thread's length.
     """
     is_bags = are_bags(options.paths)
-    for name in REFERENCE_OPTIONS if is_bags else BAG_OPTIONS:
+    of_bags = ("setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
+    for name in ("solver", "segments", "rig") if is_bags else of_bags:
         value = getattr(options, name)
         if value != options.default_of(name):
             why = "for reference trajectories; PATH is none" if is_bags else "for bags; PATH is a reference trajectory"

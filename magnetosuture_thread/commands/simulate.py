@@ -34,16 +34,10 @@ from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import GraphError
 from magnetosuture_thread.settings.files import find_file, whole_folder
 
-# Topics on which nothing may come before the run begins.
-OPTIONAL = (
-    *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.NEEDLE_TIP, topics.TIP_SETPOINT, topics.FAULT_REQUEST),
-    *(topics.MATERIAL, topics.FORECAST, *topics.PROCEDURES),
-)
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
 EXTRA_TIME = 20.0  # s of simulated time, beyond a path's or run's own
 MIN_RATE = 0.5  # of real time; the least that the rig's setting `rate` takes
 MAX_PAUSE = 30.0  # s; in which a person resumes a procedure that does not go on by itself, or nobody is there
-MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another camera than the setup's
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -106,8 +100,11 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
 
 
 def too_slow(skipped: int, taken: int, rate: float) -> str:
-    """Return that a run skipped more frames than `MAX_SKIPPED`, and what to do; empty if it did not."""
-    if not skipped or skipped < MAX_SKIPPED * (skipped + taken):
+    """Return that a run skipped a tenth of the frames or more, and what to do; empty if it did not.
+
+    Then the needle is steered by another camera than the setup's.
+    """
+    if not skipped or skipped < 0.1 * (skipped + taken):
         return ""
     remedy = f"try --rate {max(MIN_RATE, 0.5 * rate):g}" if rate > MIN_RATE else "end other programs"
     return f"{skipped} of {skipped + taken} frames skipped; {remedy}"
@@ -496,11 +493,13 @@ def _wired(folder: str, coils: int) -> dict[str, str]:
 
 
 def _wait(recorder: clients.Recorder, check: Callable[[], None], log: Log) -> None:
-    """Wait until every topic has a publisher, except those in `OPTIONAL`, and for the first prediction.
+    """Wait until every topic on which something comes before a run begins has a publisher, then for a prediction.
 
     On a busy machine the first frames take tracker and model a second or more; a run that had begun would lack them.
     """
-    optional = {topic.name for topic in OPTIONAL}
+    commanded = (topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.NEEDLE_TIP, topics.FAULT_REQUEST)
+    others = (topics.TIP_SETPOINT, topics.MATERIAL, topics.FORECAST, *topics.PROCEDURES)
+    optional = {topic.name for topic in (*commanded, *others)}
     deadline, logged = time.monotonic() + live.START_TIMEOUT, set[str]()
     while missing := [name for name in recorder.silent() if name not in optional]:
         check()

@@ -23,7 +23,6 @@ from magnetosuture_thread.settings.interface import PRESS_TIMEOUT, STARTS
 MAX_MESSAGE_CHARS = 4096
 HELLO_TIMEOUT = 5.0  # after the connection [s]
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
-MAX_WATCHER_RATE = 20  # per second, besides receipts; beyond, a page without the token is disconnected
 MAX_PENDING_REQUESTS = 4  # of one page, besides those of `UNLEASED`
 MAX_UNACKNOWLEDGED = 2  # states in flight, and frames
 # Allowed for every page with the token, with or without control.
@@ -588,7 +587,8 @@ class Client:
     def _count_message(self, now: float) -> bool:
         """Count a message; return whether it exceeds the maximum rate."""
         self._message_count = self._rate.count(self.address, now)
-        exceeded = self._message_count > (MAX_MESSAGE_RATE if self.has_token else MAX_WATCHER_RATE)
+        # A page without the token is disconnected beyond 20 a second, besides receipts.
+        exceeded = self._message_count > (MAX_MESSAGE_RATE if self.has_token else 20)
         self._excess += exceeded
         return exceeded
 

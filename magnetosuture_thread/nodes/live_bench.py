@@ -44,8 +44,6 @@ from magnetosuture_thread.vision.lens import lens_of
 Vector = NDArray[np.float64]
 
 BRIDGE, TRACKER = "coil_bridge", "vision_tracker"
-FRAMES = 24  # in which a needle's length is measured
-SAME_LENGTH = 1e-3  # of a needle, as a share; less is not worth another start of the nodes
 
 
 class LiveBench(clients.CoilClient):
@@ -200,7 +198,8 @@ class LiveBench(clients.CoilClient):
         self.callback(self._leave)
         self.needle_length = self._measure_needle()
         for node in (BRIDGE, TRACKER):
-            if abs(float(self._parameters(node, "needle_length")[0]) / self.needle_length - 1.0) > SAME_LENGTH:
+            share = float(self._parameters(node, "needle_length")[0]) / self.needle_length
+            if abs(share - 1.0) > 1e-3:  # less is not worth another start of the nodes
                 self._restart(node, {"needle_length": self.needle_length})
         self._await_pose(self._now())
         self.execute("arm")
@@ -224,7 +223,7 @@ class LiveBench(clients.CoilClient):
             lens.poll()
             new = [image_of(message) for message, _ in camera.read()]
             images.extend(new if lens.value is None else [lens.value.undistorted(image) for image in new])
-            return len(images) >= FRAMES
+            return len(images) >= 24
 
         self.wait_for(look, lambda: GraphError(f"{len(images)} frames of the camera within {clients.TIMEOUT:g} s"))
         for inbox in (camera, lens):

@@ -27,7 +27,6 @@ from magnetosuture_thread.rig.settings import Fault, RigSettings
 from magnetosuture_thread.settings import interface
 
 PERIOD = 0.005  # s between two looks at the boards, which keep real time; simulated, between two messages on /clock
-EPOCH = 1_000_000_000  # ns; simulated time begins here, as time 0 means "not set" in ROS
 
 
 class RigSimulatorNode(GuardedNode):
@@ -54,7 +53,8 @@ class RigSimulatorNode(GuardedNode):
             self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
             self.rig.warm_up()
         self._model = self.resolve_topic_name(topics.PREDICTED_THREAD.name)
-        self.time = Timeline(EPOCH if self._simulated else self.get_clock().now().nanoseconds, rate)
+        # Simulated time begins at 1 s, as time 0 means "not set" in ROS.
+        self.time = Timeline(1_000_000_000 if self._simulated else self.get_clock().now().nanoseconds, rate)
         self.time.begin()
         self.serve(interface.Service.PAUSE_RIG, self.time.on_pause)
         self._phase: float | None = None

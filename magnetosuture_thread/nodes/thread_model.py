@@ -20,7 +20,6 @@ from magnetosuture_thread import (
     MagnetosutureError,
     NeedlePose,
     Scene,
-    ThreadEstimate,
     ThreadForecaster,
 )
 from magnetosuture_thread.bags import reading
@@ -233,7 +232,12 @@ class ThreadHealth:
         if prediction is not None:
             figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} µs"}
         if estimate is not None:
-            figures |= self._estimate_figures(estimate)
+            self._refused_pieces += len(estimate.problems)
+            figures["measured"] = f"{100.0 * (1.0 - estimate.hidden):.0f} %"
+            figures["deviation"] = f"{1e3 * float(estimate.deviation.max()):.3f} mm"
+            figures["refused_pieces"] = self._refused_pieces
+            if estimate.problems:
+                figures["last_refused_piece"] = estimate.problems[0]
         if result.problem is not None:
             self._health.error(str(result.problem), **figures)
         elif self._waiting:
@@ -264,15 +268,6 @@ class ThreadHealth:
             why = f" ({estimate.problems[0]})" if estimate.problems else ""
             troubles.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
         return troubles
-
-    def _estimate_figures(self, estimate: ThreadEstimate) -> dict[str, object]:
-        self._refused_pieces += len(estimate.problems)
-        figures: dict[str, object] = {
-            "measured": f"{100.0 * (1.0 - estimate.hidden):.0f} %",
-            "deviation": f"{1e3 * float(estimate.deviation.max()):.3f} mm",
-            "refused_pieces": self._refused_pieces,
-        }
-        return figures | ({"last_refused_piece": estimate.problems[0]} if estimate.problems else {})
 
 
 class ThreadForecasts:

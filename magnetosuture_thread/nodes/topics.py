@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -24,6 +24,9 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES
 from magnetosuture_thread.settings.interface import Channel, Quality
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.node import GuardedNode
 
 QUALITIES = {
     Quality.SENSOR: qos_profile_sensor_data,
@@ -42,16 +45,7 @@ MAX_BYTES = {
     "sensor_msgs": MAX_FILE_BYTES,
     "visualization_msgs": 1 << 22,
 }
-MAX_OTHER_BYTES = 1 << 19
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
-
-
-class Subscriber(Protocol):
-    """A node that reports messages that are refused, by the errors of their callbacks."""
-
-    input_errors: ClassVar[tuple[type[Exception], ...]]
-    create_subscription: Callable[..., Subscription]
-    refuse: Callable[[Exception], None]
 
 
 @dataclass(frozen=True)
@@ -73,7 +67,7 @@ class Topic:
     @property
     def max_bytes(self) -> int:
         """Return how many bytes a message may have."""
-        return MAX_BYTES.get(self.channel.type_name.partition("/")[0], MAX_OTHER_BYTES)
+        return MAX_BYTES.get(self.channel.type_name.partition("/")[0], 1 << 19)
 
     @property
     def message(self) -> Any:
@@ -100,7 +94,7 @@ class Topic:
             expected = f"a {self.channel.type_name} of our definition"
             raise InvalidInputError(self.channel.name, f"{len(data)} bytes", expected) from None
 
-    def subscribe(self, node: Subscriber, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
+    def subscribe(self, node: GuardedNode, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         What comes is bytes: what is too large is not made into a message first.
@@ -117,7 +111,7 @@ class Topic:
         )
 
     def subscribe_numbered(
-        self, node: Subscriber, callback: Callable[[Any, int], None], then: Callable[[], None] = lambda: None
+        self, node: GuardedNode, callback: Callable[[Any, int], None], then: Callable[[], None] = lambda: None
     ) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
 
@@ -144,7 +138,7 @@ class Topic:
         subscription = self.subscribe(node, take, raw=True)
         return subscription
 
-    def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> bool:
+    def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> bool:
         """Call back with the message of some bytes; return whether the callback did not refuse it, else report that."""
         try:
             callback(self.decode(data))
