@@ -194,7 +194,8 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
         at_the_desk = [*shared, *_parameters({"path_follower:waypoints": f"[{path}]", "console:port": "0"})]
         log("starting the nodes at the rig and at the desk")
         rig = NodeProcesses(AT_THE_RIG, at_the_rig, environment, Path(folder, "rig"))
-        desk = NodeProcesses(AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=desk_prefix)
+        desk = NodeProcesses(AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"))
+        desk.prefix = desk_prefix
         with environment_of(environment), rig, desk, closing(CableBench(execute, (rig, desk))) as bench:
             for delay, loss, cuts in filter(lambda network: network[2], networks):
                 log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")

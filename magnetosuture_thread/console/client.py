@@ -427,8 +427,7 @@ class Client:
         number: of the connection, from 1.
         socket: the prepared WebSocket.
         request: of the connection.
-        settings: of the console.
-        token: that permits commands.
+        settings: of the console; its token permits commands.
         requests: handler of all requests but jogs; its `jog` has the control lease and the jog commands.
 
     Attributes:
@@ -444,12 +443,11 @@ class Client:
         socket: web.WebSocketResponse,
         request: web.BaseRequest,
         settings: ConsoleSettings,
-        token: str,
         requests: RequestHandler,
     ) -> None:
         self.number, self.address, self.has_token = number, request.remote or "", False
         self.is_script = True
-        self._socket, self._request, self._settings, self._token = socket, request, settings, token
+        self._socket, self._request, self._settings = socket, request, settings
         self._jog, self._requests = requests.jog, requests
         self.outbox = Outbox()
         self._delay, self._last_in_time = DelayEstimator(), 0.0  # arrival of the last message that was not late
@@ -490,7 +488,7 @@ class Client:
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
         self._lateness(parsed, asyncio.get_running_loop().time())
-        self.has_token = same_token(token := parsed.values["token"], self._token)
+        self.has_token = same_token(token := parsed.values["token"], self._settings.token)
         # Programs other than browsers name no origin.
         self.is_script = parsed.values["automated"] is not False or not self._request.headers.get("Origin")
         refusal = "the token is wrong" if token and not self.has_token else ""

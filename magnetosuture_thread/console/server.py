@@ -6,6 +6,7 @@ import asyncio
 import gc
 import ssl
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -47,8 +48,8 @@ class ConsoleServer:
     """
 
     def __init__(self, settings: ConsoleSettings, graph: Graph, host: Host) -> None:
-        self._settings, self._graph, self._host = settings, graph, host
-        self._token = settings.token or new_token()
+        self._settings = replace(settings, token=settings.token or new_token())
+        self._graph, self._host = graph, host
         self._files = page_files()
         self._jog = JogController(graph.publish_velocity, settings.rate, settings.hold_timeout)
         self._requests = RequestHandler(graph, host, self._jog)
@@ -82,7 +83,7 @@ class ConsoleServer:
         # Excludes loaded objects from garbage collection, which would take tens of milliseconds each time.
         gc.collect()
         gc.freeze()
-        return self._settings.page_url(self._port, self._token)
+        return self._settings.page_url(self._port)
 
     async def stop(self) -> None:
         """Stop the needle, then close all connections; raise the error that ended the broadcast, if any."""
@@ -104,7 +105,7 @@ class ConsoleServer:
             task.result()
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
-        if not same_token(request.query.get("token"), self._token):
+        if not same_token(request.query.get("token"), self._settings.token):
             now = asyncio.get_running_loop().time()
             if self._request_rate.count(request.remote or "", now) > 100:  # those beyond wait for the next second
                 await asyncio.sleep(1.0 - now % 1.0)
@@ -129,7 +130,7 @@ class ConsoleServer:
         if refusal := self._settings.origin_refusal(origin, host):
             return _answer(403, refusal)
         # Only for a place: commands need the token of the greeting.
-        has_token = same_token(request.query.get("token"), self._token)
+        has_token = same_token(request.query.get("token"), self._settings.token)
         if full := self._no_place(has_token, request.remote or ""):
             return _answer(503, full)
         # Pings are left to the client, which counts them.
@@ -137,7 +138,7 @@ class ConsoleServer:
         socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
-        client = Client(number, socket, request, self._settings, self._token, self._requests)
+        client = Client(number, socket, request, self._settings, self._requests)
         self._clients[number] = client
         client.has_token = has_token
         if self._frame:

@@ -74,12 +74,12 @@ class ConsoleSettings(shared.SceneName, shared.NeedleArc):
         """Return the scheme of the server: https where it has a certificate."""
         return "https" if self.certificate else "http"
 
-    def page_url(self, port: int, token: str) -> str:
+    def page_url(self, port: int) -> str:
         """Return the URL of the page on a port; the token is in the fragment, which browsers do not send."""
         numeric = _numeric(self.address)
         address = "127.0.0.1" if numeric is not None and numeric.is_unspecified else self.address
         host = f"[{address}]" if ":" in address else address
-        return f"{self.origin or f'{self.scheme}://{host}:{port}'}/#token={quote(token, safe='')}"
+        return f"{self.origin or f'{self.scheme}://{host}:{port}'}/#token={quote(self.token, safe='')}"
 
     def is_own_host(self, host: str) -> bool:
         """Return whether a Host header is that of the origin under which the page is reached besides."""

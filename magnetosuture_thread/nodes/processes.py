@@ -98,19 +98,15 @@ class NodeProcesses:
         arguments: for each, after `--ros-args`.
         environment: for each.
         logs: folder that gets a log file of each.
+
+    Attributes:
         prefix: of each command, as of one that runs it on another host; it has to become the process itself.
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        arguments: Sequence[str],
-        environment: dict[str, str],
-        logs: Path,
-        *,
-        prefix: Sequence[str] = (),
-    ) -> None:
-        self._names, self._prefix, self._arguments = names, prefix, arguments
+    prefix: Sequence[str] = ()
+
+    def __init__(self, names: Sequence[str], arguments: Sequence[str], environment: dict[str, str], logs: Path) -> None:
+        self._names, self._arguments = names, arguments
         # What a node keeps over a restart is of this run: an emergency stop of another one does not hold here.
         self._state = tempfile.TemporaryDirectory(prefix="magnetosuture_state_")
         self._environment = {**environment, "XDG_STATE_HOME": self._state.name}
@@ -149,7 +145,7 @@ class NodeProcesses:
             arguments: besides those for all, after `--ros-args`.
         """
         program = [module] if module else ["magnetosuture_thread.nodes.program", name]
-        command = [*self._prefix, sys.executable, "-m", *program, "--ros-args", *self._arguments, *arguments]
+        command = [*self.prefix, sys.executable, "-m", *program, "--ros-args", *self._arguments, *arguments]
         with (self._logs / f"{name}.log").open("wb") as log:
             streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
             # In a session of its own: Ctrl-C is ours to pass on.

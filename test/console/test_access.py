@@ -62,8 +62,8 @@ def test_tokens_are_compared_whole():
 
 def test_every_start_has_a_token_of_its_own_and_it_is_in_the_fragment_alone():
     assert new_token() != new_token()
-    assert ConsoleSettings().page_url(8090, "a%b#c") == "http://127.0.0.1:8090/#token=a%25b%23c"
-    assert settings("::1", certificate="c.pem").page_url(80, "t").startswith("https://[::1]:80/#")
+    assert ConsoleSettings(token="a%b#c" * 4).page_url(8090) == "http://127.0.0.1:8090/#token=" + "a%25b%23c" * 4
+    assert settings("::1", certificate="c.pem").page_url(80).startswith("https://[::1]:80/#")
 
 
 LOCAL, RIG = "127.0.0.1", "https://rig.example"
