@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import stamp_of
-from magnetosuture_thread.commands.command import Terminal, add_actions, make_table
+from magnetosuture_thread.commands.command import Terminal, add_actions, make_table, write_json
 from magnetosuture_thread.commands.simulate import measure_loop, simulate
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.recorded import read_image
@@ -156,8 +155,7 @@ def thread_behavior(
             records = bag.records({COMPRESSED_IMAGE.recorded})
             images = {stamp: read_image(record) for record in records if (stamp := stamp_of(record)) in stamps}
             runs.append(BehaviorRun(setup, summary, instants, images))
-        figures = [run.summary.to_json() for run in runs]
-        (folder / "behaviour.json").write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_json(folder / "behaviour.json", [run.summary.to_json() for run in runs])
         if picture := picture_or_log(partial(draw_behavior, runs), log):
             (folder / "behaviour.png").write_bytes(picture)
     return runs

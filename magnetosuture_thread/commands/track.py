@@ -78,18 +78,22 @@ def add_view(parser: argparse.ArgumentParser) -> None:
 
 
 def chosen_view(options: argparse.Namespace) -> tuple[VisionTrackerSettings, Scene]:
-    """Return the settings and the scene that the options of `add_view` choose."""
+    """Return the settings and the scene that the options choose: those of `add_view`, and of the needle if any."""
     given = read_scene(options.scene) if options.scene else None
     if options.dish_diameter is not None:
         given = Scene.create(dish_diameter=options.dish_diameter)
     settings, scene = read_vision_setup(options.setup, given)
-    view = {
+    length, width = vars(options).get("needle") or (None, None)
+    values = {
         "metres_per_pixel": options.metres_per_pixel,
         "dish_centre_px": tuple(options.centre or ()),
         "region_px": tuple(options.region or ()),
         "rim": options.rim,
+        "needle_length": length,
+        "needle_width": width,
+        "max_needle_brightness": vars(options).get("needle_brightness"),
     }
-    chosen: dict[str, Any] = {name: value for name, value in view.items() if value}
+    chosen: dict[str, Any] = {name: value for name, value in values.items() if value}
     return replace(settings, **chosen), scene
 
 
@@ -115,10 +119,6 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     Where no frame shows a needle the command fails.
     """
     settings, scene = chosen_view(options)
-    length, width = options.needle or (None, None)
-    needle = {"needle_length": length, "needle_width": width, "max_needle_brightness": options.needle_brightness}
-    chosen: dict[str, Any] = {name: value for name, value in needle.items() if value}
-    settings = replace(settings, **chosen)
     source = open_frames(options, terminal.log)
     warm_up()
     if source.is_sequence and source.names:
