@@ -464,15 +464,11 @@ class _Sink:
 
 def _arm() -> None:
     """Arm the bridge as soon as its boards are ready."""
-    deadline = time.monotonic() + 15.0
-    while True:
-        try:
-            with clients.CoilClient() as client:
-                client.execute("arm")
-                return
-        except GraphError as error:
-            if time.monotonic() > deadline:
-                raise GraphError(f"the bridge cannot be armed: {error}") from None
+    try:
+        with clients.CoilClient() as client:
+            client.execute_within(15.0, "arm")
+    except GraphError as error:
+        raise GraphError(f"the bridge cannot be armed: {error}") from None
 
 
 def _wired(folder: str, coils: int) -> dict[str, str]:

@@ -341,6 +341,23 @@ class CoilClient(Participant):
         time.sleep(0.15)  # for the bridge to publish its new state
         return message
 
+    def execute_within(self, seconds: float, *actions: str) -> None:
+        """Execute commands one after another; where one is rejected, all again, until the time is over [s].
+
+        Raises:
+            GraphError: as `execute`.
+        """
+        deadline = time.monotonic() + seconds
+        while True:
+            try:
+                for action in actions:
+                    self.execute(action)
+                return
+            except GraphError:
+                if time.monotonic() > deadline:
+                    raise
+            self.wait(0.2)
+
     def state(self) -> dict[str, Any]:
         """Return the state of the bridge as text for display.
 
@@ -378,6 +395,12 @@ class CoilClient(Participant):
         """Wait for a moment, and take what has come."""
         time.sleep(POLL_PERIOD)
         self.spin_some()
+
+    def wait(self, seconds: float) -> None:
+        """Take what comes for a while [s]."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.turn()
 
     def wait_for(self, read: Callable[[], Any], failed: Callable[[], Exception], timeout: float = TIMEOUT) -> Any:
         """Return what a function returns, once that is true.

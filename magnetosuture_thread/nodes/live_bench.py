@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -128,10 +128,10 @@ class LiveBench(clients.CoilClient):
         times = [0.0, 0.0]
 
         def disturb() -> None:
-            self._wait(after)
+            self.wait(after)
             with disturbance:
                 times[0] = self._now()
-                self._wait(hold)
+                self.wait(hold)
                 times[1] = self._now()
 
         return self._pulse(currents, seconds, disturb, hold + TO_REST + RESTING), times[0], times[1]
@@ -171,21 +171,12 @@ class LiveBench(clients.CoilClient):
             return
         if not any(reason.startswith(cause) for reason in state.reasons for cause in causes):
             raise GraphError(f"coil_bridge: {'; '.join(state.reasons)}")
-        deadline = time.monotonic() + clients.TIMEOUT
-        while True:
-            try:
-                self.execute("reset")
-                self.execute("arm")
-                return
-            except GraphError:  # boards that were lost are connected again
-                if time.monotonic() > deadline:
-                    raise
-            self._wait(0.2)
+        self.execute_within(clients.TIMEOUT, "reset", "arm")  # boards that were lost are connected again
 
     def _begin(self) -> None:
         """Check what has to be, measure the needle, and arm."""
         state = self._wait_for_state()
-        self._wait(clients.DISCOVERY_TIME)
+        self.wait(clients.DISCOVERY_TIME)
         commissioning, self.driver_timeout = self._parameters(BRIDGE, "commissioning", "driver_timeout")
         if not commissioning:
             name, expected = f"{BRIDGE}.commissioning", "true: start the bridge by -p coil_bridge:commissioning:=true"
@@ -242,7 +233,7 @@ class LiveBench(clients.CoilClient):
             during()
             on, off, ended = self._await_end(seconds)
         else:
-            self._wait(seconds)
+            self.wait(seconds)
             off = self._now()
         self._await_pose((max(off, self._now()) if longer else off) + max(AFTER, longer))
         frames = [(stamp, pose) for stamp, pose in self._poses if stamp > on - BEFORE]
@@ -294,11 +285,6 @@ class LiveBench(clients.CoilClient):
         patience = PATIENCE + max(0.0, since - self._now())
         self.wait_for(lambda: self._poses and self._poses[-1][0] > since, failed, patience)
 
-    def _wait(self, seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.turn()
-
     def turn(self) -> None:
         """Wait for a moment, and take what has come."""
         self._check()
@@ -322,16 +308,18 @@ class LiveBench(clients.CoilClient):
     def _now(self) -> float:
         return float(self.node.get_clock().now().nanoseconds) * 1e-9
 
+    def _run(self, calls: Coroutine[Any, Any, Any]) -> Any:
+        """Return what comes of calls of services, unless somebody interrupts."""
+        result = asyncio.run(calls)
+        self._check()
+        return result
+
     def _ask(self, name: str, request: Any) -> Any:
         """Return the answer of a service, which is called once."""
-        answer = asyncio.run(self._calls.call(name, request, timeout=clients.TIMEOUT, retry_period=math.inf))
-        self._check()
-        return answer
+        return self._run(self._calls.call(name, request, timeout=clients.TIMEOUT, retry_period=math.inf))
 
     def _parameters(self, node: str, *names: str) -> list[Any]:
-        values = asyncio.run(clients.parameters_of(self._calls, node, names))
-        self._check()
-        return [*values.values()]
+        return [*self._run(clients.parameters_of(self._calls, node, names)).values()]
 
     def _restart(self, node: str, values: Mapping[str, Any]) -> None:
         """Give a node other parameters, by its lifecycle."""
@@ -340,9 +328,7 @@ class LiveBench(clients.CoilClient):
         self._set(node, values)
 
     def _set(self, node: str, values: Mapping[str, Any]) -> None:
-        is_active = asyncio.run(clients.restart(self._calls, node, values))
-        self._check()
-        self._require(is_active, node)
+        self._require(self._run(clients.restart(self._calls, node, values)), node)
         if node == BRIDGE:
             self._await_driver()
 
@@ -369,7 +355,7 @@ class LiveBench(clients.CoilClient):
     def _require(self, success: bool, node: str) -> None:
         """Raise a `GraphError` with what a node reports of itself where it has refused something."""
         if not success:
-            self._wait(0.2)  # for the reason, on /diagnostics
+            self.wait(0.2)  # for the reason, on /diagnostics
             raise GraphError(f"{node}: {self._report(node)[0]}")
 
 

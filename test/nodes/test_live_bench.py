@@ -164,7 +164,7 @@ def test_a_bench_is_blind_while_the_tracker_is_inactive_and_sees_again(opened: C
     with bench:
         with bench.blind():
             assert not tracker.is_active
-            bench._wait(1.1)
+            bench.wait(1.1)
             with pytest.raises(InvalidInputError, match="no needle pose for 1 s"):
                 bridge.system.bridge.pulse(LEAST, 0.1, *bridge._times(), bridge.system.driver_state)
         assert tracker.is_active
@@ -192,7 +192,7 @@ def test_an_interrupt_amid_a_pulse_leaves_zero_currents_and_a_bridge_that_is_dis
 def test_without_poses_it_says_what_the_tracker_says(opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch):
     bench, _, _ = opened()
     with bench, bench.blind():
-        bench._wait(0.5)
+        bench.wait(0.5)
         monkeypatch.setattr(live_bench, "PATIENCE", 0.3)
         with pytest.raises(InvalidInputError, match=r"no pose for 0\.3 s: inactive"):
             bench.pulse(LEAST, 0.1)
