@@ -70,11 +70,11 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
     notes["rig"] = "a rig that runs" if options.live else poses
     if not options.live:
         notes["simulated"] = f"the rig {options.rig or 'of the setup'}, {poses}"
-    with _bench(setup, options) as (driven_bench, is_live, check):
-        how: dict[str, Any] = {"simulated": not is_live, "poses": notes["rig"], "rig": options.rig or setup.name}
+    with _bench(setup, options) as (driven_bench, check):
+        how: dict[str, Any] = {"simulated": not options.live, "poses": notes["rig"], "rig": options.rig or setup.name}
         stops = folder / files.STOPS_FILE
         bench = files.RecordedBench(driven_bench, folder / files.PULSES, notes)
-        first = {"check_stops": partial(files.checked_stops, driven_bench, stops, terminal.log)} if is_live else {}
+        first = {"check_stops": partial(files.checked_stops, driven_bench, stops, terminal.log)} if options.live else {}
         radius = setup.scene.dish.radius
         result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check, **first).run()
         result = files.verify_square(result, setup, bench)
@@ -103,23 +103,23 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
 
 
 @contextmanager
-def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, bool, Callable[[], None]]]:
-    """Yield the bench of the options, whether it is a rig that runs, and what raises an interruption that is kept."""
+def _bench(setup: Setup, options: argparse.Namespace) -> Iterator[tuple[Any, Callable[[], None]]]:
+    """Yield the bench of the options, and what raises an interruption that is kept."""
     if not options.live:
-        bench = SimulatedBench(with_rig(setup, options.rig), drawn=options.drawn_poses, seed=options.seed)
-        yield bench, False, lambda: None
+        rig = with_rig(setup, options.rig)
+        yield SimulatedBench(rig, drawn=options.drawn_poses, seed=options.seed), lambda: None
         return
     from magnetosuture_thread.nodes.live_bench import LiveBench  # late, as it needs ROS
     from magnetosuture_thread.nodes.processes import Interruption
 
     with Interruption() as interruption, LiveBench(setup, interruption.check, options.namespace) as live:
-        yield live, True, interruption.check
+        yield live, interruption.check
 
 
 def _check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     setup = read_setup(options.setup)
     rig = files.read_rig(options.output, setup.coils)
-    with _bench(setup, options) as (bench, _, check):
+    with _bench(setup, options) as (bench, check):
         radius = setup.scene.dish.radius
         commissioning = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check)
         changed = commissioning.check(rig)
