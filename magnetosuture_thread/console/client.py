@@ -511,7 +511,7 @@ class Client:
 
     async def _on_message(self, kind: WSMsgType, data: Any) -> None:
         now = asyncio.get_running_loop().time()
-        self._jog.keep_alive(self.number)
+        self._jog.lease.keep_alive(self.number, now)
         try:
             exceeded = self._count_message(now)
             parsed = self._read(kind, data)

@@ -190,10 +190,6 @@ class JogController:
         if self.lease.release(client):
             self._send(self.switch.release())
 
-    def keep_alive(self, client: int) -> None:
-        """Register a message of a client."""
-        self.lease.keep_alive(client, _now())
-
     def set_visible(self, client: int, visible: bool) -> None:
         """Register whether a client's page is visible; a hidden one cannot jog."""
         self.lease.set_hidden(client, not visible)
