@@ -22,8 +22,6 @@ from magnetosuture_thread.settings.files import whole_file
 from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
-MAX_FRAMES = 50  # that a camera is calibrated by
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -150,7 +148,8 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     if by_markers and (options.region or options.rim):
         raise BagError(options.frames[0], "is calibrated by --markers, so --region and --rim have no meaning for it")
     source = open_frames(options, terminal.log)
-    every = max(1, -(-source.count // MAX_FRAMES))  # evenly over a long bag or video
+    max_frames = 50
+    every = max(1, -(-source.count // max_frames))  # evenly over a long bag or video
     images, unused = [], ""
     for frame in islice(source.frames, 0, None, every):
         if frame.image is None:
@@ -160,7 +159,7 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
                 raise problem
             unused = f"{problem}; it is not used"
         images.append(frame.undistorted())
-        if len(images) == MAX_FRAMES:  # of a video that does not say how many it has
+        if len(images) == max_frames:  # of a video that does not say how many it has
             break
     source.log_refused(terminal.log)
     if unused:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 
 from magnetosuture_thread.commands.command import Terminal, namespace_argument
-from magnetosuture_thread.nodes.clients import CoilClient
-
-ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "deactivate", "cleanup")
+from magnetosuture_thread.nodes.clients import ACTIONS, CoilClient
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("action", choices=ACTIONS, metavar="ACTION", help=", ".join(ACTIONS))
+    actions = ("state", *ACTIONS, "configure", "activate", "deactivate", "cleanup")
+    parser.add_argument("action", choices=actions, metavar="ACTION", help=", ".join(actions))
     parser.add_argument("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the bridge")
 
 

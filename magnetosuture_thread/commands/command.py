@@ -26,7 +26,6 @@ from magnetosuture_thread.settings.files import input_problem, output_problem, p
 DONE, FAILED, WRONG_USE = 0, 1, 2
 STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks
 EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
-OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
 
 Run: TypeAlias = "Callable[[argparse.Namespace, Terminal], int | None]"  # returns the exit code; None is `DONE`
 
@@ -200,12 +199,13 @@ def check_outputs(options: argparse.Namespace) -> None:
     Raises:
         ConfigurationError: with the option.
     """
+    outputs = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
     inputs, taken = list[Path](), list[Path]()
     for name, value in vars(options).items():
-        if name not in OUTPUTS:
+        if name not in outputs:
             listed = value if isinstance(value, list) else [value]
             inputs += [Path(each) for each in listed if isinstance(each, Path | str) and each != ""]
-    for name in OUTPUTS:
+    for name in outputs:
         path = getattr(options, name, None)
         if not isinstance(path, Path) or path == STANDARD_OUTPUT:
             continue

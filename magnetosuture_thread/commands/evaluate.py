@@ -29,8 +29,6 @@ from magnetosuture_thread.settings.files import is_url, whole_file, whole_folder
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-MARKS = {"simulated": "* simulated", "unverified": "? unverified", "silences": "! frames are missing"}  # by column
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -335,9 +333,11 @@ def _draw_case(case: reference.CaseResult, formulation: str) -> bytes:
 def bags_table(rows: Sequence[Any]) -> Any:
     """Return the table of bags for a terminal: the figures that matter most, of estimate and prediction."""
     columns = ("bag", "frames", "truth", "max", "measured", "max", "margin", "step")
+    # What is said of a bag, by the column that is not empty.
+    marks = {"simulated": "* simulated", "unverified": "? unverified", "silences": "! frames are missing"}
     cells: list[Sequence[str]] = []
     for row in rows:
-        name = " ".join([str(row["bag"]), *(mark[0] for column, mark in MARKS.items() if row[column])])
+        name = " ".join([str(row["bag"]), *(mark[0] for column, mark in marks.items() if row[column])])
         if row["problem"]:
             cells.append((name, "failed"))
             continue
@@ -353,7 +353,7 @@ def bags_table(rows: Sequence[Any]) -> Any:
     caption = (
         "errors in % of the length, mean and maximum over time; margin: least clearance of an obstacle, chords too"
     )
-    caption += "".join(f"; {mark}" for column, mark in MARKS.items() if any(row[column] for row in rows))
+    caption += "".join(f"; {mark}" for column, mark in marks.items() if any(row[column] for row in rows))
     silences = [(row["silent_s"], row["max_silence_s"]) for row in rows if row["silences"]]
     if silences:
         total, longest = sum(silent for silent, _ in silences), max(gap for _, gap in silences)

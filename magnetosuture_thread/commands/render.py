@@ -23,9 +23,6 @@ from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.settings.files import whole_folder
 
-SIZE = (640, 480)
-EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "not set" in ROS
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -113,13 +110,14 @@ def render_bag(
     measure = _frames(setup, reference, quality, seed) if pose_noise is None else _poses(setup, pose_noise, seed)
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
         bag.add_topic(interface.SCENE.recorded, interface.SCENE.type_name)
-        begin = round((start + EPOCH) * 1e9)
+        epoch = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "not set" in ROS
+        begin = round((start + epoch) * 1e9)
         bag.write(interface.SCENE.recorded, begin, packing.packed_scene(begin, setup.scene))
         for index in range(frames):
             time = start + index / rate
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)
             velocity = (reference.at(after)[0] - reference.at(before)[0]) / (after - before)
-            stamp, (tail, heading, thread) = round((time + EPOCH) * 1e9), reference.at(time)
+            stamp, (tail, heading, thread) = round((time + epoch) * 1e9), reference.at(time)
             outputs = (
                 *measure(stamp, tail, heading, thread),
                 (interface.NEEDLE_COMMAND, packing.packed_twist(stamp, velocity)),
@@ -163,7 +161,8 @@ Measure: TypeAlias = "Callable[[int, Points, float, Points], packing.Outputs]"  
 
 def _frames(setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> Measure:
     """Return what makes a camera frame and its camera_info."""
-    view = DishView((322.0, 238.0), setup.scene.dish.diameter / (0.9115 * SIZE[1]))
+    size = (640, 480)
+    view = DishView((322.0, 238.0), setup.scene.dish.diameter / (0.9115 * size[1]))
     scene = CameraScene(
         dish_diameter=setup.scene.dish.diameter,
         needle_length=setup.vision.needle_length,
@@ -171,7 +170,7 @@ def _frames(setup: Setup, reference: ReferenceTrajectory, quality: int, seed: in
         thread_diameter=setup.model.thread().diameter,
         obstacles=reference.discs,
     )
-    camera = DishCamera(scene, view, SIZE, seed)
+    camera = DishCamera(scene, view, size, seed)
 
     def measure(stamp: int, tail: Points, heading: float, thread: Points) -> packing.Outputs:
         jpeg = encode_jpeg(camera.render(tail, heading, thread), quality)

@@ -20,7 +20,6 @@ from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, MagnetosutureError
 from magnetosuture_thread.settings.interface import PRESS_TIMEOUT, STARTS
 
-MAX_MESSAGE_CHARS = 4096
 HELLO_TIMEOUT = 5.0  # after the connection [s]
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
 MAX_PENDING_REQUESTS = 4  # of one page, besides those of `UNLEASED`
@@ -146,8 +145,8 @@ def _refusal(name: str, value: object, expectation: str) -> InvalidInputError:
 
 
 def _object(text: str) -> dict[str, Any]:
-    if len(text) > MAX_MESSAGE_CHARS:
-        raise InvalidInputError("message", f"{len(text)} characters", f"at most {MAX_MESSAGE_CHARS}")
+    if len(text) > 4096:
+        raise InvalidInputError("message", f"{len(text)} characters", "at most 4096")
 
     def not_finite(name: str) -> NoReturn:
         raise InvalidInputError("message", name, "finite numbers")
