@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.coils.heading_observer import TORQUE_ANGLE, TORQUE_TIME
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics, NeedleTwist, limit_pair
 
 Vector = NDArray[np.float64]
@@ -271,8 +272,9 @@ class FollowMonitor:
 
     A turn proves no place, and a moving place no heading. So the displacement by currents and pull is kept since the
     middle was last seen to move, with the pull that was known then, and the turn of the field since the heading was
-    last seen to turn: that is how far a needle has gone whose poses are not its own. Beyond `MAX_UNSEEN`, or
-    `MAX_UNSEEN_TURN` of a needle that nothing but its thread touches, they are taken for that.
+    last seen to turn, less what a thread's torque may take of it: that is how far a needle has gone whose poses are not
+    its own. Beyond `MAX_UNSEEN`, or `MAX_UNSEEN_TURN` of a needle that nothing but its thread touches, they are taken
+    for that.
 
     Nor are poses the needle's that change their motion faster than a pull does: the mean of nu . nu / (2 S) of the
     observer's filter over `MIN_WINDOW`, and at least `MIN_INNOVATIONS` poses, is at most `MAX_INNOVATION`.
@@ -403,10 +405,10 @@ class FollowMonitor:
         elif step.driven.any():
             self._unseen = self._unseen + step.driven + step.interval * self._proven
         self._proven = min(self._proven, step.pull, key=lambda pull: math.hypot(*pull))
-        self._still_turn, self._unseen_turn = (
-            self._still_turn + step.measured_turn,
-            self._unseen_turn + step.expected_turn,
-        )
+        self._still_turn, unseen = self._still_turn + step.measured_turn, self._unseen_turn + step.expected_turn
+        # A torque that lasts keeps the needle off its field by as much, whatever the model says of its turning.
+        held = step.interval * TORQUE_ANGLE / TORQUE_TIME
+        self._unseen_turn = math.copysign(max(0.0, abs(unseen) - held), unseen)
         if abs(self._still_turn) > VISIBLE_TURN:
             self._still_turn = self._unseen_turn = 0.0
 

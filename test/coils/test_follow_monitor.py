@@ -190,3 +190,12 @@ def test_a_pull_that_a_still_place_does_not_show_is_compensated_for_half_of_the_
     counted = held_against(monitor, np.array([1.5e-3, 0.0]), moves=False)
     assert counted[-1] == pytest.approx(1e-4)
     assert sum(counted) * INTERVAL < 1.1e-3
+
+
+@pytest.mark.parametrize(("rate", "is_fault"), [(0.09, False), (-0.09, False), (0.3, True), (-0.3, True)])
+def test_a_field_that_turns_no_faster_than_a_torque_holds_the_needle_is_no_turn(rate: float, is_fault: bool):
+    """A field that is there beside that of the coils keeps a needle off its direction for good."""
+    monitor, faults = FollowMonitor(5e-4), list[str]()
+    for k in range(400):
+        faults.append(monitor.update(MotionStep(k * INTERVAL, INTERVAL, EAST, rate * INTERVAL, EAST, 0.0, STILL, EAST)))
+    assert any("not seen to turn" in fault for fault in faults) is is_fault
