@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from benchmarks.report import figures_table
 from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.geometry.obstacles import Polygon, Workspace
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Vector
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.program import ChainProgram, Solution, Solver, Vector, residuals_of
+from magnetosuture_thread.thread.program import ChainProgram, Solution, Solver, residuals_of
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver, OsqpSolver, as_quadratic_program
 from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState

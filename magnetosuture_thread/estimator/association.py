@@ -11,14 +11,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Mask, Points, Vector
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
-Vector = NDArray[np.float64]
 Obstacles = tuple[Workspace, float]
 
 MAX_PIECES = 64  # of an observation
@@ -33,7 +31,7 @@ GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther
 
 
 @compiled
-def path_without_outliers(points: Points, spacing: float, penalty: float) -> NDArray[np.bool_]:
+def path_without_outliers(points: Points, spacing: float, penalty: float) -> Mask:
     """Return which points of a piece lie on its path, shape (m,).
 
     The path goes through the points in their order. A step costs what it is longer than twice the spacing of the

@@ -24,21 +24,18 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator.association import MeasuredPoints
 from magnetosuture_thread.geometry.compiled import TypedKernel, compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Table, Vector
 from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, Table, program_view, residuals_with
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, program_view, residuals_with
 from magnetosuture_thread.thread.rod import STRAIN_TOLERANCE, RodFormulation, segment_rows
 from magnetosuture_thread.thread.solvers import BandedSolver
-
-Vector = NDArray[np.float64]
 
 MAX_SOLVES = 8  # of a correction
 RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
@@ -238,7 +235,7 @@ def _write_row(
 
 
 @compiled_within
-def selected_inverse(width: int, unknowns: int, band: NDArray[np.float64], inverse: NDArray[np.float64]) -> None:
+def selected_inverse(width: int, unknowns: int, band: Table, inverse: Table) -> None:
     """Write the entries within the band of the inverse of L D L', in time linear in its size.
 
         Z = D^-1 L^-1 + (I - L') Z,    column by column from the last
@@ -356,7 +353,7 @@ class Correction(NamedTuple):
     residual: float
     positions: Points
     moved: Points
-    covariance: NDArray[np.float64]
+    covariance: Table
     hidden: float
 
 

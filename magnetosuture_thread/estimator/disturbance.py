@@ -7,13 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator.correction import normals_of
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Mask, Points, Vector
 from magnetosuture_thread.thread.material import Attachment, Thread
-
-Vector = NDArray[np.float64]
 
 AVERAGING_TIME = 0.4  # s; over which corrections are added up
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
@@ -204,7 +201,7 @@ class DisturbanceTest:
         self._since, self._significance = math.nan, 0.0
         self._gap = False
 
-    def decay(self, interval: float, in_contact: NDArray[np.bool_]) -> None:
+    def decay(self, interval: float, in_contact: Mask) -> None:
         """Let time pass.
 
         Args:

@@ -20,7 +20,7 @@ from magnetosuture_thread.estimator.association import LENGTH_ERROR
 from magnetosuture_thread.estimator.correction import Correction, Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
+from magnetosuture_thread.geometry.polyline import Points, Table, Vector, arc_lengths, chain_inside
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.configuration import bounded, checked_arguments, plain
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
@@ -29,8 +29,6 @@ from magnetosuture_thread.thread.prediction import MAX_COORDINATE, TIME, NeedleP
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.step import ThreadState, WarmStart
-
-Vector = NDArray[np.float64]
 
 ONE_SIDED_99 = 2.3263478740408408  # standard deviations
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
@@ -75,7 +73,7 @@ class ThreadEstimate:
 
     prediction: Prediction
     positions: Points
-    covariance: NDArray[np.float64]
+    covariance: Table
     deviation: Vector
     corrected: bool
     unmeasured_for: float
@@ -105,7 +103,7 @@ class ThreadEstimate:
 
 
 def clearance_bound(
-    nodes: NDArray[Any], gradient: NDArray[np.float64], clearance: Vector, covariance: Points, neighbours: bool = False
+    nodes: NDArray[Any], gradient: Table, clearance: Vector, covariance: Points, neighbours: bool = False
 ) -> Vector:
     """Return the one-sided 99 % bound of each margin of a barrier as a distance [m].
 

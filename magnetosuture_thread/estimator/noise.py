@@ -19,13 +19,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator.association import MeasuredPoints
 from magnetosuture_thread.estimator.correction import normals_of, robust_weights
-from magnetosuture_thread.geometry.polyline import Points
-
-Vector = NDArray[np.float64]
+from magnetosuture_thread.geometry.polyline import Mask, Points, Table, Vector
 
 WINDOWS = 16
 GRID = 10.0 ** np.arange(-17.0, -5.5)
@@ -240,7 +237,7 @@ def raised_intensity(
     variance: Points,
     likelihood: Points,
     intensity: Vector,
-    seen: NDArray[np.bool_],
+    seen: Mask,
     interval: float,
     settled: bool,
 ) -> Vector:
@@ -268,7 +265,7 @@ def raised_intensity(
 
 
 def take_correction(
-    points: MeasuredPoints, normals: Points, moved: Points, covariance: NDArray[np.float64], density: Vector
+    points: MeasuredPoints, normals: Points, moved: Points, covariance: Table, density: Vector
 ) -> tuple[Points, Vector]:
     """Return variance and density after a correction, and what each window was moved by.
 

@@ -11,12 +11,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator import ThreadEstimate
 from magnetosuture_thread.estimator.estimator import observation_of
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
+from magnetosuture_thread.geometry.polyline import Points, Vector, lay_behind_needle
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
@@ -62,7 +61,7 @@ class PredictionResult:
     late: bool = False
     scene_version: str = ""
     law: FrictionLaw | None = field(default=None, repr=False, compare=False)
-    speeds: NDArray[np.float64] = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
+    speeds: Vector = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
 
     @cached_property
     def margins(self) -> Margins | None:

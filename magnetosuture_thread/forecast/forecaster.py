@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.filter import NeedleSafetyFilter
 from magnetosuture_thread.estimator import ThreadEstimate
@@ -27,7 +26,16 @@ from magnetosuture_thread.forecast.rollout import (
 )
 from magnetosuture_thread.geometry.compiled import TypedKernel
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
-from magnetosuture_thread.geometry.polyline import Points, as_numbers, chain_inside, finite_array, lay_behind_needle
+from magnetosuture_thread.geometry.polyline import (
+    Indices,
+    Mask,
+    Points,
+    Vector,
+    as_numbers,
+    chain_inside,
+    finite_array,
+    lay_behind_needle,
+)
 from magnetosuture_thread.geometry.scene import WALL_NAME, Scene
 from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
@@ -39,7 +47,6 @@ from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, NO_SHAPE
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation, StepInput
 from magnetosuture_thread.thread.step import WarmStart
 
-Vector = NDArray[np.float64]
 Controller = Callable[[float, Vector, Vector], Vector]
 """Velocity of the tip [m/s] for the time since the start [s], the needle's tail [m] and its heading, shapes (2,)."""
 
@@ -176,25 +183,25 @@ class Forecast:
     """
 
     stamp: float
-    times: NDArray[np.float64]
-    vertices: NDArray[np.float64]
+    times: Vector
+    vertices: Vector
     tails: Points
     headings: Points
     commanded: Points
     filtered: Points
-    slowdown: NDArray[np.float64]
-    margins: dict[str, NDArray[np.float64]]
-    friction: NDArray[np.bool_]
-    tension: NDArray[np.float64]
+    slowdown: Vector
+    margins: dict[str, Vector]
+    friction: Mask
+    tension: Vector
     needle_force: Points
     converged: bool
     problem: str
     shapes: tuple[str, ...]
     scene_version: str
-    margin_nodes: NDArray[np.int64] = field(repr=False)
-    margin_shapes: NDArray[np.int64] = field(repr=False)
+    margin_nodes: Indices = field(repr=False)
+    margin_shapes: Indices = field(repr=False)
     contact_tolerance: float
-    touched: NDArray[np.bool_] = field(repr=False)
+    touched: Mask = field(repr=False)
 
     @property
     def horizon(self) -> float:
@@ -316,7 +323,7 @@ class _ThreadWalk:
     """
 
     def __init__(
-        self, formulation: RodFormulation, start: ForecastStart, nodes: NDArray[np.int64], options: PredictorOptions
+        self, formulation: RodFormulation, start: ForecastStart, nodes: Indices, options: PredictorOptions
     ) -> None:
         self._formulation, self._nodes, self._options = formulation.separate(), nodes, options
         if start.warm_start is not None and start.interval > 0.0:
@@ -527,7 +534,7 @@ class ThreadForecaster:
             touched=touched[:done],
         )
 
-    def _friction(self, start: ForecastStart, slowed: bool) -> Callable[[Points, NDArray[np.bool_]], float]:
+    def _friction(self, start: ForecastStart, slowed: bool) -> Callable[[Points, Mask], float]:
         """Return the friction law over one forecast: it writes the nodes under friction, and returns the slowdown."""
         law, nodes, averaging = self._law, self.thread.segments + 1, self._averaging
         if law is None:
@@ -537,7 +544,7 @@ class ThreadForecaster:
         memory = last, velocities, share, self.step, self._around, law.threshold + 0.5 * self.thread.diameter
         contacts, close = self._contacts(), np.zeros(nodes, np.int64)
 
-        def slowdown(vertices: Points, rubbed: NDArray[np.bool_]) -> float:
+        def slowdown(vertices: Points, rubbed: Mask) -> float:
             count, fastest = self._friction_nodes(vertices, *memory, contacts, close, rubbed)
             return law.beta**count if count and slowed and fastest > law.stuck_speed else 1.0
 

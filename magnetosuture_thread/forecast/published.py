@@ -7,16 +7,13 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator import ThreadEstimate
 from magnetosuture_thread.forecast.forecaster import Forecast, ForecastStart, ThreadForecaster
 from magnetosuture_thread.geometry.compiled import compiled
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Vector
 from magnetosuture_thread.thread.prediction import NeedlePose
-
-Vector = NDArray[np.float64]
 
 APPROACH = 4.0  # 1/s; at which a needle that is off its plan comes back to it
 

@@ -6,17 +6,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.certificate import FilterData, PosedNeedle, pose_needle
 from magnetosuture_thread.coils.needle_motion import filter_velocity, moved_needle, needle_margin
 from magnetosuture_thread.geometry.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.compiled import compiled, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts, half_segment_distance
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Table, Vector
 from magnetosuture_thread.thread.barriers import link_margins
 from magnetosuture_thread.thread.mechanics import RodProperties
-from magnetosuture_thread.thread.program import NO_SHAPE, Indices, Mask, Table, Vector
+from magnetosuture_thread.thread.program import NO_SHAPE
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins of a forecast."""
@@ -216,5 +215,5 @@ def least_margins(
 def empty_margins(instants: int) -> tuple[Table, Indices, Indices]:
     """Return margins that are of nothing, their nodes and shapes, each of shape (k, 5)."""
     kinds = instants, len(KINDS)
-    nodes: NDArray[np.int64] = np.zeros(kinds, np.int64)
+    nodes: Indices = np.zeros(kinds, np.int64)
     return np.full(kinds, np.inf), nodes, np.full(kinds, NO_SHAPE)

@@ -13,6 +13,10 @@ from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.settings.errors import InvalidInputError, shortened
 
 Points = NDArray[np.float64]
+Vector = NDArray[np.float64]
+Table = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 MIN_TURN_RATIO = 0.3  # of the radius of a circle that a polyline turns in
 
 

@@ -12,14 +12,14 @@ from typing import Any, cast
 import numpy as np
 
 from magnetosuture_thread.geometry.obstacles import measure, pack_obstacles
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Vector
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.planning import executor
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, ThreadGoal, Wait, Wrap
 from magnetosuture_thread.planning.verdict import centre_of, winding
-from magnetosuture_thread.rig.closed_loop import LATENCY, ClosedLoop, LoopFrame, LoopRecorder, Vector
+from magnetosuture_thread.rig.closed_loop import LATENCY, ClosedLoop, LoopFrame, LoopRecorder
 from magnetosuture_thread.rig.ground_truth import GoalTruth
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.rig.setups import Setup

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.bags import packing
 from magnetosuture_thread.bags.packing import packed_scene
@@ -18,7 +17,7 @@ from magnetosuture_thread.coils.bridge import NEEDLE, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.estimator.thread_session import PredictionResult, ThreadSession
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.geometry.polyline import Points, Vector, arc_lengths, points_at
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.camera import encode_jpeg
@@ -28,8 +27,6 @@ from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.vision.tracker import TrackerSession
-
-Vector = NDArray[np.float64]
 
 START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
 LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph

@@ -13,12 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-
-Vector = NDArray[np.float64]
+from magnetosuture_thread.geometry.polyline import Indices, Vector
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 BLOCK = 8  # edges of a polygon that are passed over together where all of them are too far
@@ -48,10 +46,10 @@ class Shapes(NamedTuple):
     corners: Vector
     normals: Vector
     convex: Vector
-    starts: NDArray[np.int64]
+    starts: Indices
     boxes: Vector
     blocks: Vector
-    block_starts: NDArray[np.int64]
+    block_starts: Indices
     grid: Vector
     clearances: Vector
     wall: float

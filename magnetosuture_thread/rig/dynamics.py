@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from magnetosuture_thread.coils.field import fields_per_current
 from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.rig.contact import Shapes, Surface, Vector, clear, point_contacts
+from magnetosuture_thread.geometry.polyline import Points, Vector, chain_along
+from magnetosuture_thread.rig.contact import Shapes, Surface, clear, point_contacts
 from magnetosuture_thread.rig.rod import (
     WIDTH,
     NeedleJoint,

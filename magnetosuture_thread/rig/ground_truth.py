@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.planning.procedure import (
     BringEnd,
@@ -29,7 +29,6 @@ from magnetosuture_thread.planning.procedure import (
     Wrap,
 )
 
-Vector = NDArray[np.float64]
 ESTIMATE_ERROR = 2e-4  # m, by which an estimated thread may be off
 
 

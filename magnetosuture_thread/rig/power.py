@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
 PRIORITY = 11  # of SCHED_FIFO, where permitted: above what nodes have by default
@@ -430,7 +430,7 @@ class StageProcess:
         self._process.join()
         self._process = self._pipe = None
 
-    def currents(self) -> tuple[NDArray[np.float64], float]:
+    def currents(self) -> tuple[Vector, float]:
         """Return the coils' mean currents since the last call, shape (2 boards,) [A], and until when [s].
 
         Raises:

@@ -9,17 +9,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.packing import Outputs, Stamp, packed_path, packed_pose_stamped, packed_wrench
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Vector
 from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.rig.camera import Cover, DishCamera, Image
 from magnetosuture_thread.rig.settings import COVERS, KINDS, Fault, RigSettings
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
-
-Vector = NDArray[np.float64]
 
 RELEASE_TIME = 1.0  # s without currents asked for, after which a rig with a problem tries again
 

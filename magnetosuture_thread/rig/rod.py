@@ -32,10 +32,10 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
-from magnetosuture_thread.rig.contact import Shapes, Vector, clear, point_contacts, segment_contacts, write_row
+from magnetosuture_thread.geometry.polyline import Mask, Vector
+from magnetosuture_thread.rig.contact import Shapes, clear, point_contacts, segment_contacts, write_row
 
 WIDTH = 6  # of the band: half-width and diagonal
 NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
@@ -327,7 +327,7 @@ def back_substitute(band: Vector, right: Vector) -> None:
 
 
 @compiled
-def crossings(q: Vector) -> NDArray[np.bool_]:
+def crossings(q: Vector) -> Mask:
     """Return which segments cross each other, shape (n, n)."""
     segments = q.shape[0] // 2 - 1
     side = np.empty((segments, segments + 1))  # of the line of each segment, on which each node is
@@ -344,7 +344,7 @@ def crossings(q: Vector) -> NDArray[np.bool_]:
 
 
 @compiled_uncounted
-def find_pairs(q: Vector, rod: Rod, shapes: Shapes, crossed: NDArray[np.bool_], rows: Vector) -> int:
+def find_pairs(q: Vector, rod: Rod, shapes: Shapes, crossed: Mask, rows: Vector) -> int:
     """Write what of the thread is near itself at the start of a step, see `add_rows`.
 
     What crosses itself already is free to move apart.

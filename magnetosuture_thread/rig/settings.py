@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Vector
 from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.rig.camera import LOOKS, CameraScene, DishCamera, Lighting
 from magnetosuture_thread.rig.contact import Surface
@@ -217,7 +216,7 @@ class RigSettings(
                 expectation = f"{name} in the dish, off the obstacles: it would be in {what}"
                 raise ConfigurationError(f"{self.GROUP}.needle_start", start, expectation)
 
-    def thread_at_start(self, at: NDArray[np.float64]) -> Points:
+    def thread_at_start(self, at: Vector) -> Points:
         """Return points along the thread as it lies at the start, `at` from 0 to 1, shape (m, 2) [m]."""
         *tail, heading = self.needle_start
         return needle_axis(np.array(tail), heading + math.pi, self.thread_length, self.thread_start_curvature, at)[0]

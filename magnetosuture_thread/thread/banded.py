@@ -37,8 +37,8 @@ from typing import NamedTuple
 import numpy as np
 
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.program import SPAN, ChainProgram, Mask, Solution, Table, Vector, residuals_of
+from magnetosuture_thread.geometry.polyline import Mask, Points, Table, Vector
+from magnetosuture_thread.thread.program import SPAN, ChainProgram, Solution, residuals_of
 
 Axes = tuple[int, ...]
 

@@ -29,14 +29,10 @@ from magnetosuture_thread.geometry.obstacles import (
     nearest_edge,
     wall_contact,
 )
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Table, Vector
 from magnetosuture_thread.settings.errors import ConfigurationError, SolverError
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.mechanics import RodProperties, chord_lengths
-
-Vector = NDArray[np.float64]
-Table = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @compiled_inline
@@ -320,7 +316,7 @@ class WallAvoidance(_ContactBarrier):
 
 
 @compiled_uncounted
-def move_inside(positions: Points, known: NDArray[np.bool_], radius: float) -> None:
+def move_inside(positions: Points, known: Mask, radius: float) -> None:
     """Move each free node that is outside of a circle about the origin onto it, radially.
 
     The nearest point of a convex set: no two nodes that are both moved, or inside, get farther apart by it.
@@ -354,7 +350,7 @@ class Stiffness(RowBarrier):
     """
 
     name = STIFFNESS
-    rest_distance: NDArray[np.float64]
+    rest_distance: Vector
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n - 1 rows at positions of shape (n + 1, d)."""
@@ -417,9 +413,9 @@ def find_self_contacts(
     diameter: float,
     segment: float,
     crossing: bool,
-    nodes: NDArray[np.int64],
-    gradient: NDArray[np.float64],
-    value: NDArray[np.float64],
+    nodes: Indices,
+    gradient: Table,
+    value: Vector,
 ) -> tuple[int, int]:
     """Write the rows of nodes near segments of the same thread, at the end of a straight motion.
 

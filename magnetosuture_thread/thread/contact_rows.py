@@ -24,17 +24,8 @@ import numpy as np
 from magnetosuture_thread.geometry.chords import find_chord_contacts
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.program import (
-    CONTACT,
-    GRIPS,
-    NO_SHAPE,
-    SPAN,
-    GripBuffers,
-    RodBuffers,
-    StepBuffers,
-    Vector,
-)
+from magnetosuture_thread.geometry.polyline import Points, Vector
+from magnetosuture_thread.thread.program import CONTACT, GRIPS, NO_SHAPE, SPAN, GripBuffers, RodBuffers, StepBuffers
 
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
 

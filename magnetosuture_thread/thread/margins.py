@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.barrier import OBSTACLE, WALL, BarrierRows
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Table, Vector
 
 SOLID = (OBSTACLE, WALL)
 """Barriers of what a thread can touch."""
@@ -72,7 +72,7 @@ def constant_column(value: float, count: int, kind: str = "f8") -> NDArray[Any]:
     return column
 
 
-def _nothing() -> NDArray[np.float64]:
+def _nothing() -> Vector:
     return constant_column(0.0, 0)
 
 
@@ -96,10 +96,10 @@ class BarrierMargins:
     barrier: str
     node: NDArray[np.uint32]
     obstacle: NDArray[np.int32]
-    value: NDArray[np.float64]
-    clearance: NDArray[np.float64]
-    bound: NDArray[np.float64] = field(default_factory=_nothing)
-    normal: NDArray[np.float64] = field(default_factory=_nothing)
+    value: Vector
+    clearance: Vector
+    bound: Vector = field(default_factory=_nothing)
+    normal: Table = field(default_factory=_nothing)
 
     def __post_init__(self) -> None:
         """Take no bound as one that is not known."""
@@ -172,7 +172,7 @@ class Margins(Mapping[str, BarrierMargins]):
         """The row of least clearance of each barrier that has rows, as margins of one row; its bound is the least."""
         return tuple(_row(margins, margins.closest) for margins in self.barriers if len(margins))
 
-    def with_bounds(self, bounds: Mapping[str, NDArray[np.float64]]) -> Margins:
+    def with_bounds(self, bounds: Mapping[str, Vector]) -> Margins:
         """Return the same margins with bounds of the clearances of some barriers [m], by name."""
         barriers = tuple(
             replace(each, bound=bounds[each.barrier]) if each.barrier in bounds else each for each in self.barriers
@@ -207,7 +207,7 @@ def _row(margins: BarrierMargins, row: int) -> BarrierMargins:
     return BarrierMargins(margins.barrier, margins.node[part], margins.obstacle[part], value, clearance, least)
 
 
-def node_clearance(margins: Margins, count: int) -> NDArray[np.float64]:
+def node_clearance(margins: Margins, count: int) -> Vector:
     """Return the minimum clearance of a shape or the wall for each of `count` nodes [m]; inf where none is near.
 
     Args:
@@ -244,7 +244,7 @@ class FrictionLaw:
     stuck_speed: float
     by_bound: bool = False
 
-    def classify(self, margins: Mapping[str, BarrierMargins], speeds: NDArray[np.float64]) -> Friction:
+    def classify(self, margins: Mapping[str, BarrierMargins], speeds: Vector) -> Friction:
         """Return the friction of a thread.
 
         Args:
@@ -281,13 +281,13 @@ class NodeMotion:
         self._velocity: Points | None = None
 
     @property
-    def speeds(self) -> NDArray[np.float64]:
+    def speeds(self) -> Vector:
         """Each node's speed, shape (n + 1,) [m/s]; empty before the first time."""
         if self._velocity is None:
             return np.empty(0)
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", self._velocity, self._velocity)))
 
-    def update(self, vertices: Points, interval: float) -> NDArray[np.float64]:
+    def update(self, vertices: Points, interval: float) -> Vector:
         """Return each node's speed, shape (n + 1,) [m/s].
 
         Args:

@@ -9,9 +9,9 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.settings.errors import ConfigurationError
@@ -178,7 +178,7 @@ class Thread:
         return self.length / self.segments
 
     @property
-    def rest_angles(self) -> NDArray[np.float64]:
+    def rest_angles(self) -> Vector:
         """Angle by which the thread at rest turns at each inner node, D kappa_i, shape (n - 1,) [rad]."""
         return self.segment_length * np.broadcast_to(np.asarray(self.rest_curvature, dtype=float), self.segments - 1)
 

@@ -16,21 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner, compiled_within
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Table, Vector
 from magnetosuture_thread.thread.margins import FrictionState
-from magnetosuture_thread.thread.program import (
-    CONTACT,
-    END,
-    END_VELOCITIES,
-    INTERNAL,
-    SPAN,
-    RodBuffers,
-    Table,
-    Vector,
-)
+from magnetosuture_thread.thread.program import CONTACT, END, END_VELOCITIES, INTERNAL, SPAN, RodBuffers
 
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
 CURVATURE_CORRECTION = 1.0 / 6.0  # of the energy, by the slope of the curvature
@@ -64,21 +54,21 @@ class RodProperties(NamedTuple):
     drag_along: float
     mass_per_length: float
     bending_damping: float
-    gravity: NDArray[np.float64]
-    rest_angles: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    bands: NDArray[np.float64]
-    flow: NDArray[np.float64]
+    gravity: Vector
+    rest_angles: Vector
+    weights: Vector
+    bands: Table
+    flow: Vector
 
 
 @compiled_inner
 def metric(
     positions: Points,
-    weights: NDArray[np.float64],
+    weights: Vector,
     inertia: float,
     across: float,
     along: float,
-    blocks: NDArray[np.float64],
+    blocks: Table,
 ) -> None:
     """Write the metric Z_i of each node.
 
@@ -112,7 +102,7 @@ def metric(
             blocks[i, a, a] += weights[i] * (inertia + across)
 
 
-def end_corrected_weights(segments: int) -> NDArray[np.float64]:
+def end_corrected_weights(segments: int) -> Vector:
     """Return how many segments each node stands for, shape (n + 1,).
 
         w = 1/2, 1, ..., 1, 13/12, 5/12
@@ -130,7 +120,7 @@ def end_corrected_weights(segments: int) -> NDArray[np.float64]:
     return weights
 
 
-def bending_bands(segments: int, clamped: bool) -> NDArray[np.float64]:
+def bending_bands(segments: int, clamped: bool) -> Vector:
     """Return the bands of the bending Hessian K, shape (4, n + 1): K[i, i + k] is at [k, i].
 
         E_bend / (EI / D) = 1/2 sum_i w_i |c_i|^2  +  1/2 sum_i (1/6) |c_{i+1} - c_i|^2
@@ -163,7 +153,7 @@ def bending_bands(segments: int, clamped: bool) -> NDArray[np.float64]:
 
 @compiled_inner
 def bending_gradient(
-    positions: Points, heading: Points, clamped: bool, rest_angles: NDArray[np.float64], work: Points, gradient: Points
+    positions: Points, heading: Points, clamped: bool, rest_angles: Vector, work: Points, gradient: Points
 ) -> None:
     """Write the derivative of E_bend / (EI / D) by every node's position.
 
@@ -226,7 +216,7 @@ def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> Non
 
 
 @compiled_inner
-def chord_lengths(positions: Points, heading: Points, clamped: bool, chords: NDArray[np.float64]) -> None:
+def chord_lengths(positions: Points, heading: Points, clamped: bool, chords: Vector) -> None:
     """Write the length of the chord between the ends of each segment, whose arc is 1 long, shape (n,).
 
         chord / arc = 1 - kappa^2 / 24
@@ -254,10 +244,10 @@ def tension_stiffness(
     positions: Points,
     heading: Points,
     clamped: bool,
-    tension: NDArray[np.float64],
+    tension: Vector,
     min_tension: float,
     interval: float,
-    program: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    program: tuple[Vector, Vector, Vector],
 ) -> None:
     """Add what the tension does through the chords, implicit in u.
 

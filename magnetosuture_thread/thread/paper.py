@@ -30,7 +30,7 @@ import numpy as np
 
 from magnetosuture_thread.geometry.barrier import Barrier
 from magnetosuture_thread.geometry.obstacles import WALL, Workspace
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Table
 from magnetosuture_thread.settings.configuration import bounded, checked_arguments
 from magnetosuture_thread.thread.barriers import (
     Connectivity,
@@ -42,7 +42,7 @@ from magnetosuture_thread.thread.barriers import (
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.margins import BarrierMargins
 from magnetosuture_thread.thread.material import Thread
-from magnetosuture_thread.thread.program import SPAN, Solver, Table, first_rows
+from magnetosuture_thread.thread.program import SPAN, Solver, first_rows
 from magnetosuture_thread.thread.step import AddedRows, Formulation, PrescribedMotion, StepResult, ThreadState
 
 WEIGHT = bounded("", 1e-30, 1e12)

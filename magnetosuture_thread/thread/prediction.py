@@ -9,10 +9,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.needle_arc import MAX_NORM_ERROR
-from magnetosuture_thread.geometry.polyline import Points, as_numbers
+from magnetosuture_thread.geometry.polyline import Points, Vector, as_numbers
 from magnetosuture_thread.settings.configuration import Quantity, plain
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.margins import Margins
@@ -31,7 +30,7 @@ class NeedleMotion(NamedTuple):
         turning: rate at which its heading turns, counter-clockwise, in the plane [rad/s].
     """
 
-    velocity: NDArray[np.float64]
+    velocity: Vector
     turning: float
 
 
@@ -89,7 +88,7 @@ class Prediction:
     formulation: str
     scene_version: str
     positions: Points
-    strain: NDArray[np.float64]
+    strain: Vector
     interval: float
     substeps: int
     solver: str
@@ -118,7 +117,7 @@ class Prediction:
         return {**self.__dict__, "compute_margins": None, "compute_forces": None, "margins": margins, "forces": forces}
 
     @property
-    def tension(self) -> NDArray[np.float64] | None:
+    def tension(self) -> Vector | None:
         """Tension of each segment, shape (n,) [N]; None where there are no `forces`."""
         return None if self.forces is None else self.forces.tension
 

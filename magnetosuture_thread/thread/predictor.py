@@ -13,7 +13,7 @@ import numpy as np
 
 from magnetosuture_thread.geometry.barrier import Barrier, check_barriers
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside, finite_array
+from magnetosuture_thread.geometry.polyline import Indices, Points, arc_lengths, chain_inside, finite_array
 from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.settings.configuration import Quantity, bounded, checked_arguments
 from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
@@ -23,7 +23,7 @@ from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, 
 from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
-from magnetosuture_thread.thread.program import SOLVED, Indices
+from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import make_solver
 from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState, WarmStart

@@ -22,12 +22,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Contacts
-from magnetosuture_thread.geometry.polyline import Points
-
-Vector = NDArray[np.float64]
-Table = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Table, Vector
 
 SPAN = 3  # nodes that a row of the band touches, and how far apart nodes may be coupled
 CONTACTS_PER_NODE = 64  # for which there is room; a smooth outline has dozens of corners beside one segment

@@ -45,7 +45,7 @@ from magnetosuture_thread.geometry.compiled import (
     compiled_within,
 )
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Table, Vector
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.barriers import SelfContact, distance_row, link_margins, move_inside
@@ -74,14 +74,10 @@ from magnetosuture_thread.thread.program import (
     NO_SHAPE,
     SOLVED,
     SPAN,
-    Indices,
-    Mask,
     Residuals,
     RodBuffers,
     Solver,
     StepBuffers,
-    Table,
-    Vector,
     first_rows,
     program_view,
     residuals_with,

@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Table, Vector
 from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.thread.banded import BandedSolver
-from magnetosuture_thread.thread.program import SOLVED, SPAN, ChainProgram, Solution, Solver, Vector, residuals_of
+from magnetosuture_thread.thread.program import SOLVED, SPAN, ChainProgram, Solution, Solver, residuals_of
 
 __all__ = ["SOLVERS", "BandedSolver", "FallbackSolver", "OsqpSolver", "make_solver"]
 
@@ -81,7 +81,7 @@ def as_quadratic_program(program: ChainProgram) -> QuadraticProgram:
     )
 
 
-def _rows(columns: NDArray[np.intp], gradient: NDArray[np.float64], width: int) -> sp.csc_matrix:
+def _rows(columns: NDArray[np.intp], gradient: Table, width: int) -> sp.csc_matrix:
     """Return rows with a gradient at some coordinates, both of shape (r, k, d)."""
     row = np.repeat(np.arange(len(columns)), columns[:1].size)
     return sp.csc_matrix((gradient.ravel(), (row, columns.ravel())), (len(columns), width))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.barrier import OBSTACLE, WALL, Barrier, BarrierRows
 from magnetosuture_thread.geometry.compiled import TypedKernel
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.geometry.polyline import Points, chain_along
+from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Table, Vector, chain_along
 from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.barriers import SolidRows, solid_rows
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE
@@ -22,14 +22,10 @@ from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.program import (
     ChainProgram,
-    Indices,
-    Mask,
     Residuals,
     Solution,
     Solver,
     StepBuffers,
-    Table,
-    Vector,
     first_rows,
     residuals_of,
 )

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.thread.barriers import Connectivity, EnhancedConnectivity, Stiffness
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
-from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector
+from magnetosuture_thread.thread.program import ChainProgram, Solution
 from magnetosuture_thread.thread.solvers import BandedSolver
 from magnetosuture_thread.thread.step import ThreadState
 from test.thread.scenes import DT, TOLERANCE, east, followed, formulated, lead, polyamide, straight

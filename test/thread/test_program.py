@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.thread.program import (
     ChainProgram,
     Residuals,
     Solution,
     Solver,
-    Vector,
     no_far_rows,
     residuals_of,
 )

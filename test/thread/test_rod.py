@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.material import Attachment, Thread
-from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solution, Vector
+from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solution
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
 from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState
