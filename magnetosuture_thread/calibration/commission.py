@@ -13,37 +13,20 @@ from itertools import combinations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.pulse_model import DELAY_UNIT, KINDS, Pulse, PulseModel, RigParameters, kind_of
 from magnetosuture_thread.coils.pulses import MAX_TIME
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.settings.errors import InvalidInputError
-
-Vector = NDArray[np.float64]
 
 BEFORE, AFTER = 0.2, 0.35  # s of poses before and after a pulse
 PATIENCE = 2.0  # s without a pose, after which there is none
-REST_TIME = 1.0  # s; for which the needle is watched before anything moves it
-MAX_DRIFT = 1e-4  # m/s; of a needle at rest: a faster one floats in a stream, or is pulled by something
-START_RADIUS = 0.6  # of the dish's, within which the needle's middle must be
-LEAST_CURRENT, MOST_CURRENT = 0.01, 3.0  # A
-LADDER_TIME = 0.4  # s; of a pulse of a coil by itself
-ANSWER = 2e-4  # m; a motion that tells a direction, fifteen deviations of a tracked end; at the greatest current half
-ALIGNED, ALIGNING = 0.2, 6  # rad; a needle that turns less in a pulse lies along the field; and pulses until it does
-NOTICED = 3e-5, 0.03  # m and rad; less is no sign that a coil acts, and the current is made four times as large
-MAX_SPEED, MAX_TURN_RATE = 6e-3, 5.0  # m/s and rad/s; predicted of a designed pulse, for the tracker follows no faster
+LEAST_CURRENT = 0.01  # A
 PULSE_TIME = 0.1, MAX_TIME  # s; of a designed pulse
-PATH = 2e-4, 1.2e-3  # m; of a designed pulse: what tells something, and what stays near
-REACH = 0.5  # of the dish's radius, to which a designed pulse may lead
-CHANCE = 1.3  # by which a doubt of the heading may grow: of a half turn against the field nobody foresees the way
-BATCH, MOST_PULSES, TRIES = 6, 60, 8
 VERIFIED = 12  # pulses
 MEDIAN_ERROR, WORST_ERROR, HEADING_ERROR = 0.05, 0.20, math.radians(3.0)  # of the verdict
-CHECK_ERROR = 0.12  # of the way; beyond it a rig is another one, and a coil at 0.8 is
 SQUARE_ERROR = 1e-3  # m; of the verdict too
-THINNED = 3  # one frame in so many is enough to tell on which side a coil is
-LEAST_WAY = 3e-4  # m; a shorter displacement counts as this one, for it is measured to some micrometres
 FRAME_TIME = 0.02  # s; between predicted poses of a design; no pulse is shorter, however early it ends
 
 
@@ -156,7 +139,7 @@ class Commissioning:
         self._bench, self._believed, self._radius, self._log = bench, believed, dish_radius, log
         self._random, self._length = np.random.default_rng([seed, 7]), bench.needle_length
         self._pulses: list[Pulse] = []
-        self._most, self._check_stops = min(MOST_CURRENT, believed.max_current), check_stops
+        self._most, self._check_stops = min(3.0, believed.max_current), check_stops  # A
         self._check = check
 
     def run(self) -> Commissioned:
@@ -184,9 +167,9 @@ class Commissioning:
         self._log(f"ladder: {len(self._pulses)} pulses, residual {math.sqrt(model.chi_square):.2f} deviations")
         top = max(answer.current for answer in answers)
         begun, wide, history = len(self._pulses), list(model.names), list[tuple[float, ...]]()
-        while wide and len(self._pulses) < begun + MOST_PULSES:
-            new = sum(self._designed(model, top, TRIES) for _ in range(BATCH))
-            if not new:
+        while wide and len(self._pulses) < begun + 60:
+            # Six pulses, each the most telling of eight, are fitted together.
+            if not sum(self._designed(model, top, 8) for _ in range(6)):
                 break
             model.fit(self._pulses)
             wide = self._wide(model)
@@ -226,7 +209,8 @@ class Commissioning:
                 continue
             share, heading = self._error(model, self._pulse(chosen, PULSE_TIME[1]))
             self._log(f"coil {coil}: {share:.1%} of the way, {math.degrees(heading):.1f} degrees off")
-            if share > CHECK_ERROR or heading > 2.0 * HEADING_ERROR:
+            # A coil at 0.8 of its strength is beyond this share of the way.
+            if share > 0.12 or heading > 2.0 * HEADING_ERROR:
                 off = f"{share:.0%} of the way and {math.degrees(heading):.0f} degrees off"
                 changed.append(f"coil {coil} moves the needle {off} from what was measured")
         return changed
@@ -239,8 +223,9 @@ class Commissioning:
         pulse = replace(pulse, poses=rig.poses(pulse, pose))
         if not self._is_gentle(pulse.poses):
             return None
+        # A doubt of the heading may hardly grow: of a half turn against the field nobody foresees the way.
         turned = model.by_start(pulse, pose)[2::3, 2]
-        return None if np.abs(turned).max() > CHANCE * abs(turned[0]) else pulse
+        return None if np.abs(turned).max() > 1.3 * abs(turned[0]) else pulse
 
     def _pulse(self, currents: Vector, seconds: float) -> Pulse:
         self._pulses.append(self._bench.pulse(np.asarray(currents, dtype=float), seconds))
@@ -253,17 +238,16 @@ class Commissioning:
 
     def _rest(self) -> Vector:
         """Watch the needle at rest; return the deviations of a pose."""
-        pulse = self._pulse(np.zeros(len(self._believed.coil_angles)), REST_TIME)
+        pulse = self._pulse(np.zeros(len(self._believed.coil_angles)), 1.0)  # s
         times = pulse.times - pulse.times.mean()
         # By second differences, whose variance is six times that of white noise, as a field may turn the needle.
         noise = np.sqrt(np.mean(np.diff(pulse.poses, 2, axis=0) ** 2, axis=0) / 6.0)
         middles = middle_of(pulse.poses, self._length)
-        drift = float(np.hypot(*np.polyfit(times, middles, 1)[0]))
-        if drift > MAX_DRIFT:
-            expected = f"at most {1e3 * MAX_DRIFT:g} mm/s: a calm liquid, and nothing that pulls at the needle"
+        if (drift := float(np.hypot(*np.polyfit(times, middles, 1)[0]))) > 1e-4:  # m/s
+            expected = "at most 0.1 mm/s: a calm liquid, and nothing that pulls at the needle"
             raise InvalidInputError("needle at rest", f"a drift of {1e3 * drift:.2f} mm/s", expected)
-        if (away := float(np.hypot(*middles[-1]))) > START_RADIUS * self._radius:
-            expected = f"at most {1e3 * START_RADIUS * self._radius:.1f} mm: place it near the middle"
+        if (away := float(np.hypot(*middles[-1]))) > (room := 0.6 * self._radius):
+            expected = f"at most {1e3 * room:.1f} mm: place it near the middle"
             raise InvalidInputError("needle", f"{1e3 * away:.1f} mm from the dish's centre", expected)
         end = math.hypot(*noise[:2]) / math.sqrt(2.0)
         self._log(f"at rest: {1e6 * end:.0f} µm, {1e3 * noise[2]:.1f} mrad; needle of {1e3 * self._length:.2f} mm")
@@ -273,23 +257,24 @@ class Commissioning:
         """Raise the current of a coil alone until the needle moves, and keep it until that lies along the field."""
         currents, turn_rate = np.zeros(len(self._believed.coil_angles)), 0.0
         currents[coil] = LEAST_CURRENT
-        most = self._most
+        seconds, most = 0.4, self._most  # s; of each pulse
         while True:
-            pulse = self._pulse(currents, LADDER_TIME)
+            pulse = self._pulse(currents, seconds)
             way, turn = self._motion(pulse)
             turn_rate = max(turn_rate, abs(turn) / (max(FRAME_TIME, pulse.off - pulse.on) * currents[coil]))
             at_most = currents[coil] >= most
-            if way > (0.5 if at_most else 1.0) * ANSWER:
+            # Fifteen deviations of a tracked end tell a direction; at the greatest current half of them have to.
+            if way > (1e-4 if at_most else 2e-4):  # m
                 break
             if at_most:
                 self._log(f"coil {coil}: no answer up to {most:g} A")
                 return CoilAnswer(math.nan)
-            noticed = way > NOTICED[0] or abs(turn) > NOTICED[1]
+            noticed = way > 3e-5 or abs(turn) > 0.03  # m, rad; less is no sign that the coil acts
             currents[coil] = min(most, currents[coil] * (2.0 if noticed else 4.0))
-        for _ in range(ALIGNING):
-            pulse = self._pulse(currents, LADDER_TIME)
+        for _ in range(6):
+            pulse = self._pulse(currents, seconds)
             way, turn = self._motion(pulse)
-            if abs(turn) < ALIGNED:
+            if abs(turn) < 0.2:  # rad; it lies along the field
                 break
         middles, on = middle_of(pulse.poses, self._length), pulse.times > pulse.on
         moved = middles[-3:].mean(axis=0) - middles[~on][-1]
@@ -355,9 +340,9 @@ class Commissioning:
         middles = middle_of(poses, self._length)
         steps, away = np.hypot(*np.diff(middles, axis=0).T), np.hypot(*middles.T)
         path, turns = float(np.hypot(*(middles - middles[0]).T).max()), np.abs(np.diff(poses[:, 2]))
-        leads_out = away.max() > REACH * self._radius and away[-1] > away[0]
-        slow = steps.max() < MAX_SPEED * FRAME_TIME and turns.max() < MAX_TURN_RATE * FRAME_TIME
-        return bool(slow and not leads_out and PATH[0] < path < PATH[1])
+        leads_out = away.max() > 0.5 * self._radius and away[-1] > away[0]
+        slow = steps.max() < 6e-3 * FRAME_TIME and turns.max() < 5.0 * FRAME_TIME  # m/s, rad/s; as the tracker follows
+        return bool(slow and not leads_out and 2e-4 < path < 1.2e-3)  # m; it tells something, and stays near
 
     def _error(self, model: PulseModel, pulse: Pulse) -> tuple[float, float]:
         """Return the error of a prediction from the rest before: share of the displacement, and heading [rad]."""
@@ -367,8 +352,8 @@ class Commissioning:
         start = model.start_of(rest, pulse.poses[0])
         predicted, measured = rig.poses(pulse, start)[-5:].mean(axis=0), pulse.poses[-5:].mean(axis=0)
         error = middle_of(predicted, self._length) - middle_of(measured, self._length)
-        way, _ = self._motion(pulse)
-        return float(np.hypot(*error)) / max(way, LEAST_WAY), abs(float(predicted[2] - measured[2]))
+        way = max(self._motion(pulse)[0], 3e-4)  # m; as a shorter one is measured to some micrometres
+        return float(np.hypot(*error)) / way, abs(float(predicted[2] - measured[2]))
 
     def _wide(self, model: PulseModel) -> list[str]:
         """Return the parameters that are not known well enough."""
@@ -394,11 +379,9 @@ class Commissioning:
         if len(errors) < VERIFIED:
             return [f"only {len(errors)} of {VERIFIED} pulses could be verified: place the needle in the middle"]
         median, worst, heading = np.median(errors[:, 0]), errors[:, 0].max(), errors[:, 1].max()
+        middling = f"the median error is {median:.1%} of the displacement ({MEDIAN_ERROR:.0%} allowed)"
         checks = (
-            (
-                median > MEDIAN_ERROR,
-                f"the median error is {median:.1%} of the displacement ({MEDIAN_ERROR:.0%} allowed)",
-            ),
+            (median > MEDIAN_ERROR, middling),
             (worst > WORST_ERROR, f"the largest error is {worst:.1%} of the displacement ({WORST_ERROR:.0%} allowed)"),
             (heading > HEADING_ERROR, f"the heading is off by {math.degrees(heading):.1f} degrees (3 allowed)"),
         )
@@ -419,7 +402,8 @@ def on_their_sides(
         deviations: of a measured pose, shape (3,) [m, m, rad].
         check: called all the time; raises what interrupts.
     """
-    some = [replace(pulse, times=pulse.times[::THINNED], poses=pulse.poses[::THINNED]) for pulse in pulses]
+    # One frame in three is enough to tell on which side a coil is.
+    some = [replace(pulse, times=pulse.times[::3], poses=pulse.poses[::3]) for pulse in pulses]
 
     def error(guess: RigParameters) -> float:
         model = PulseModel(guess, deviations, check)

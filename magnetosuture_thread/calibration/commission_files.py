@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.packing import packed_pose, packed_rig_currents
 from magnetosuture_thread.bags.reader import Bag
@@ -25,6 +24,7 @@ from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.field import CoilProperties
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.evaluation.metrics import plain_values
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings import interface
@@ -32,8 +32,6 @@ from magnetosuture_thread.settings.configuration import read_yaml
 from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.settings.files import whole_file, whole_folder
 from magnetosuture_thread.settings.shared_parameters import EVERY_NODE, PARAMETERS, read_sections
-
-Vector = NDArray[np.float64]
 
 SETUP_FILE, COILS_FILE, SUMMARY_FILE, REPORT_FILE, PULSES, STOPS_FILE = (
     "setup.yaml",
@@ -44,7 +42,6 @@ SETUP_FILE, COILS_FILE, SUMMARY_FILE, REPORT_FILE, PULSES, STOPS_FILE = (
     "stops.json",
 )
 MEASURED, GAUGE, ASSUMED = "measured", "gauge", "assumed"
-CHANGED = 0.1  # of a value, beyond which the old one is shown beside it; of an angle in rad
 
 
 class RecordedBench:
@@ -185,13 +182,18 @@ class Value:
     before: float
 
     @property
+    def change(self) -> float:
+        """How far it is off what was believed, an angle in rad, else as a share; nan without that or if held."""
+        if self.kind == GAUGE:
+            return math.nan
+        if self.unit == "rad":
+            return math.remainder(self.value - self.before, math.tau)
+        return self.value / self.before - 1.0 if self.before else math.inf
+
+    @property
     def changed(self) -> bool:
         """Whether it is more than a tenth, or 0.1 rad, off what was believed."""
-        if math.isnan(self.before) or self.kind == GAUGE:
-            return False
-        if self.unit == "rad":
-            return abs(math.remainder(self.value - self.before, math.tau)) > CHANGED
-        return abs(self.value - self.before) > CHANGED * abs(self.before)
+        return abs(self.change) > 0.1
 
 
 def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]:
@@ -248,15 +250,9 @@ def write_setup(folder: Path, result: Commissioned, setup: Setup, date: str) -> 
     """
     assert result.model is not None
     rig, believed = result.model.parameters, setup.coils
+    sizes = rig.distance, rig.radius
     coils = [
-        CoilProperties(
-            coil.name,
-            math.remainder(angle, math.tau),
-            rig.distance,
-            rig.radius,
-            field,
-            resistance=coil.resistance,
-        )
+        CoilProperties(coil.name, math.remainder(angle, math.tau), *sizes, field, resistance=coil.resistance)
         for coil, angle, field in zip(believed.coils_properties(), rig.angles, rig.fields.tolist(), strict=True)
     ]
     notes = "by pulses of the coils; strengths are relative, their mean is that of the setup before"
@@ -264,10 +260,7 @@ def write_setup(folder: Path, result: Commissioned, setup: Setup, date: str) -> 
     thread = believed.thread_drag * liquid
     simulated = {"coil_angles": list(setup.rig.coil_angles), "needle_length": setup.rig.needle_length}
     changes: dict[str, dict[str, Any]] = {
-        EVERY_NODE: {
-            "needle_length": round(rig.length, 7),
-            "coil_angles": [round(coil.angle, 6) for coil in coils],
-        },
+        EVERY_NODE: {"needle_length": round(rig.length, 7), "coil_angles": [round(coil.angle, 6) for coil in coils]},
         f"{EVERY_NODE}/{CoilBridgeSettings.GROUP}": {
             "calibration": str(path),
             "commissioning": False,

@@ -16,13 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import NullFormatter
 
-from magnetosuture_thread.calibration.commission import (
-    MEDIAN_ERROR,
-    WORST_ERROR,
-    Commissioned,
-)
+from magnetosuture_thread.calibration.commission import MEDIAN_ERROR, WORST_ERROR, Commissioned
 from magnetosuture_thread.calibration.commission_files import (
-    GAUGE,
     REPORT_FILE,
     SUMMARY_FILE,
     Value,
@@ -34,7 +29,6 @@ from magnetosuture_thread.evaluation.plots import BAD, FAINT, GOOD, INK, PREDICT
 from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings.files import whole_file
 
-WIDTH, HEIGHT = 8.27, 11.69  # inch; A4
 # Factor and unit in which a value is printed, by its SI unit.
 SHOWN = {
     "rad": (math.degrees(1.0), "°"),
@@ -58,7 +52,7 @@ def draw_report(result: Commissioned, setup: Setup, summary: Mapping[str, Any], 
         date: of the report.
         kind: pdf, or png at 110 dpi.
     """
-    figure = make_figure(WIDTH, HEIGHT)
+    figure = make_figure(8.27, 11.69)  # inch; A4
     passed = not result.failures
     verdict = "Verification passed" if passed else "Refused: no setup was written"
     text: dict[str, Any] = {"color": INK, "parse_math": False, "va": "top"}
@@ -76,20 +70,17 @@ def draw_report(result: Commissioned, setup: Setup, summary: Mapping[str, Any], 
     _draw_coils(figure.add_axes((0.05, 0.625, 0.40, 0.265)), result, setup)
     if result.model is None:
         _draw_ladder(figure, result, 0.60)
-        return _saved(figure, kind)
-    _draw_verification(figure.add_axes((0.56, 0.645, 0.38, 0.085)), result)
-    _draw_table(figure, values_of(result, setup.coils), 0.60)
-    _draw_history(figure.add_axes((0.10, 0.055, 0.84, 0.10)), result)
-    notes = (
-        "Gauge: a motion shows only field x moment / drag, so the mean field and the moment are held; one reading\n"
-        "of a probe fixes teslas. Assumed: a bare needle does not show it; the thread's drag follows the needle's.\n"
-        "Bold: more than 10 % (0.1 rad) off the setup. In the camera's frame: a coil is where it shows to be."
-    )
-    figure.text(0.06, 0.222, notes, fontsize=7.5, linespacing=1.35, color=FAINT, va="top", parse_math=False)
-    return _saved(figure, kind)
-
-
-def _saved(figure: Figure, kind: str) -> bytes:
+    else:
+        _draw_verification(figure.add_axes((0.56, 0.645, 0.38, 0.085)), result)
+        _draw_table(figure, values_of(result, setup.coils), 0.60)
+        _draw_history(figure.add_axes((0.10, 0.055, 0.84, 0.10)), result)
+        notes = (
+            "Gauge: a motion shows only field x moment / drag, so the mean field and the moment are held; one reading\n"
+            "of a probe fixes teslas. Assumed: a bare needle does not show it; the thread's drag follows the "
+            "needle's.\n"
+            "Bold: more than 10 % (0.1 rad) off the setup. In the camera's frame: a coil is where it shows to be."
+        )
+        figure.text(0.06, 0.222, notes, fontsize=7.5, linespacing=1.35, **{**text, "color": FAINT})
     stream = io.BytesIO()
     metadata: dict[str, Any] = {"CreationDate": None} if kind == "pdf" else {"Software": None}
     figure.savefig(stream, format=kind, metadata=metadata)
@@ -103,10 +94,10 @@ def _draw_coils(axes: Axes, result: Commissioned, setup: Setup) -> None:
     axes.set_xlim(-1.75, 1.75)
     axes.set_ylim(-1.75, 1.75)
     axes.add_patch(Circle((0.0, 0.0), 1.0, facecolor="#f4f6f8", edgecolor=FAINT))
-    axes.annotate("", (0.45, 0.0), (0.0, 0.0), arrowprops={"arrowstyle": "->", "color": FAINT, "linewidth": 0.8})
-    axes.annotate("", (0.0, 0.45), (0.0, 0.0), arrowprops={"arrowstyle": "->", "color": FAINT, "linewidth": 0.8})
-    axes.text(0.5, 0.0, "x", fontsize=8, color=FAINT, va="center")
-    axes.text(0.0, 0.5, "y", fontsize=8, color=FAINT, ha="center")
+    arrow = {"arrowstyle": "->", "color": FAINT, "linewidth": 0.8}
+    for name, x, y, side, height in (("x", 1.0, 0.0, "left", "center"), ("y", 0.0, 1.0, "center", "baseline")):
+        axes.annotate("", (0.45 * x, 0.45 * y), (0.0, 0.0), arrowprops=arrow)
+        axes.text(0.5 * x, 0.5 * y, name, fontsize=8, color=FAINT, ha=side, va=height)
     believed = setup.coils.coils_properties()
     for k, coil in enumerate(believed):
         x, y = math.cos(coil.angle), math.sin(coil.angle)
@@ -185,7 +176,7 @@ def _draw_table(figure: Figure, values: Sequence[Value], top: float) -> None:
         factor, unit = SHOWN[value.unit]
         cells = [value.name, f"{factor * value.value:.4g} {unit}"]
         cells.append("" if math.isnan(value.interval) else f"{factor * value.interval:.2g}")
-        cells.append("" if math.isnan(value.before) or value.kind == GAUGE else f"{factor * value.before:.4g}")
+        cells.append("" if math.isnan(value.change) else f"{factor * value.before:.4g}")
         rows.append((value.changed, [*cells, _change(value), value.kind]))
     _draw_rows(figure, columns, rows, top)
 
@@ -221,11 +212,9 @@ def _draw_rows(
 
 
 def _change(value: Value) -> str:
-    if math.isnan(value.before) or value.kind == GAUGE:
+    if not math.isfinite(value.change):
         return ""
-    if value.unit == "rad":
-        return f"{math.degrees(math.remainder(value.value - value.before, math.tau)):+.1f}°"
-    return "" if not value.before else f"{100.0 * (value.value / value.before - 1.0):+.0f} %"
+    return f"{math.degrees(value.change):+.1f}°" if value.unit == "rad" else f"{100.0 * value.change:+.0f} %"
 
 
 def write_results(

@@ -13,8 +13,6 @@ from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
-LENGTHS = 2.0e-3 * 1.1 ** np.arange(16)  # m; that are tried for a needle of unknown length
-
 
 def find_needle_length(images: Sequence[NDArray[np.uint8]], settings: VisionTrackerSettings, scene: Scene) -> float:
     """Return the length of a needle as frames of it at rest show it, whatever length the settings say [m].
@@ -23,7 +21,7 @@ def find_needle_length(images: Sequence[NDArray[np.uint8]], settings: VisionTrac
         InvalidInputError: no length fits both ends.
     """
     best, length, reason = 0.0, 0.0, "no frames"
-    for tried in (settings.needle_length, *LENGTHS):
+    for tried in (settings.needle_length, *(2e-3 * 1.1 ** np.arange(16))):  # m
         tracker = VisionTracker(replace(settings, needle_length=float(tried)), scene)
         for index, image in enumerate(images):
             track = tracker.track(image, 0.1 * index)

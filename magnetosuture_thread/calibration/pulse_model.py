@@ -13,21 +13,15 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import loop_field
 from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Vector
 
-Vector = NDArray[np.float64]
 Residuals = Callable[[Vector], Vector]
 
-STEP_TURN = 0.3  # of the time in which a needle turns to its field, in a step of integration
-MAX_STEPS = 1000  # between two frames; more need parameters that no needle has, as a fit may try on its way
-STEP = 1e-4  # of a parameter, for derivatives; parameters are of order one
-START_STEP = np.array([1e-6, 1e-6, 1e-4])  # m, m and rad; of where a needle starts
 RESIDUAL_UNIT, DELAY_UNIT = 1e-4, 0.01  # T and s
 OUTLIER = 3.0  # standard deviations, beyond which a residual counts less (Huber)
-ROUNDS = 4  # of the fit, each with the starts of the one before
 # Kinds of parameters, the first two of each coil: standard deviation of what a ruler and a label say before, and the
 # 95 % interval that is narrow enough; of the logarithm, but of angles [rad], delay and residual field in their units.
 KINDS = {
@@ -44,7 +38,6 @@ KINDS = {
     "residual y": (3.0, 0.1),
 }
 END_BIAS = 1.2e-5  # m; error of a needle's end that is the same in all frames, 0.15 px of 0.08 mm
-SHAPE_BIAS = 0.004  # of a drag: of coils that are one loop here, and of the camera's scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +120,10 @@ def pulse_motion(
             acting = on - 1e-9 <= now < off - 1e-9
             until = min(times[j], off) if acting else (min(times[j], on) if now < on - 1e-9 else times[j])
             flowing = currents if acting else off_currents
-            turns = (until - now) * _rates(coils, needle, residual, flowing, pose, slope) / STEP_TURN
-            steps = max(1, math.ceil(min(turns, float(MAX_STEPS))))
+            # A step is 0.3 of the time in which the needle turns to its field. More than a thousand of them between two
+            # frames need parameters that no needle has, as a fit may try on its way.
+            turns = (until - now) * _rates(coils, needle, residual, flowing, pose, slope) / 0.3
+            steps = max(1, math.ceil(min(turns, 1000.0)))
             h = (until - now) / steps
             for _ in range(steps):
                 total[:] = 0.0
@@ -200,8 +195,8 @@ def difference(poses: Vector, others: Vector) -> Vector:
     return np.asarray(apart)
 
 
-def derivative(function: Residuals, p: Vector, steps: Vector | float = STEP) -> Vector:
-    """Return the derivative of a function of parameters by differences of a step in each, shape (rows, n)."""
+def derivative(function: Residuals, p: Vector, steps: Sequence[float] | float = 1e-4) -> Vector:
+    """Return the derivative of a function of parameters of order one by differences of a step, shape (rows, n)."""
     here, rows = function(p), np.diag(np.broadcast_to(steps, p.shape))
     return np.asarray(np.array([(function(p + row) - here) / row.sum() for row in rows]).T)
 
@@ -234,7 +229,6 @@ class PulseModel:
         self._p = np.array([*guess.angles, *np.log(np.abs(guess.fields) / self._field), *logs, *others])
         self._prior, self._weak = self._p.copy(), np.array([KINDS[kind_of(name)][0] for name in self.names])
         self.information, self.chi_square = np.diag(self._weak**-2.0), 1.0
-        self._covariance = np.diag(self._weak**2)
         self._starts: list[Vector] = []
 
     @property
@@ -257,7 +251,7 @@ class PulseModel:
     def by_start(self, pulse: Pulse, start: Vector) -> Vector:
         """Return how the predicted poses change by the pose at the start, in deviations, shape (3 k, 3)."""
         rig = self.parameters
-        return derivative(lambda pose: (rig.poses(pulse, pose) / self._sigma).ravel(), start, START_STEP)
+        return derivative(lambda pose: (rig.poses(pulse, pose) / self._sigma).ravel(), start, (1e-6, 1e-6, 1e-4))
 
     def start_of(self, pulse: Pulse, start: Vector) -> Vector:
         """Return the start that fits a pulse's frames best, by two steps of Gauss and Newton from a guess."""
@@ -267,8 +261,11 @@ class PulseModel:
             start = start + change * min(1.0, 0.3 / max(1e-9, abs(float(change[2]))))
         return start
 
-    def fit(self, pulses: Sequence[Pulse], rounds: int = ROUNDS) -> None:
-        """Fit to pulses, from the last fit on; the first fit has one round more, in which sizes are held."""
+    def fit(self, pulses: Sequence[Pulse], rounds: int = 4) -> None:
+        """Fit to pulses, from the last fit on, in rounds, each with the starts of the one before.
+
+        The first fit has one round more, in which sizes are held.
+        """
         from scipy.optimize import least_squares  # here, as it takes long to import
 
         # The first pulses tell drags and strengths from a bad guess only if sizes are held as a ruler has them.
@@ -325,6 +322,7 @@ class PulseModel:
         that share: of the needle by both ends, of a way by half, as both its ends show off alike.
         """
         share, size, count = END_BIAS / self.parameters.length, float(np.hypot(*self._p[-2:])), len(self._signs)
-        drag, both = math.hypot(SHAPE_BIAS, share), math.sqrt(2.0) * share
+        # Of a drag there is 0.004 besides, of coils that are one loop here, and of the camera's scale.
+        drag, both = math.hypot(0.004, share), math.sqrt(2.0) * share
         others = (drag, drag, drag, both, 0.0, both * size, both * size)
         return np.array([*[share] * count, *[0.5 * share] * count, 0.0, 0.0, *others])

@@ -8,14 +8,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import InitialObservation, ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, node_errors, target_points
 from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner, WorkerDiedError
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Vector, arc_lengths
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings.errors import BagError, GraphError, InvalidInputError
 from magnetosuture_thread.thread.prediction import NeedlePose
@@ -53,12 +52,12 @@ class RecordedRun:
     """
 
     name: str
-    stamps: NDArray[np.int64]
+    stamps: Indices
     tails: Points
     headings: Points
     legs: tuple[int, ...]
     initials: tuple[Points, ...]
-    frames: NDArray[np.int64]
+    frames: Indices
     targets: Points
     ground_truths: Points
     against: str = "seen"
@@ -67,17 +66,17 @@ class RecordedRun:
     unverified: str = ""
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Mask:
         """Where the targets are known, shape (K, n)."""
         return np.isfinite(self.targets[..., 0])
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> Vector:
         """Return the time of each compared frame since the first pose [s], shape (K,)."""
         return np.asarray((self.stamps[self.frames] - self.stamps[0]) * 1e-9)
 
     @property
-    def blocks(self) -> NDArray[np.int64]:
+    def blocks(self) -> Indices:
         """Which block of time each compared frame is in, 0 to `BLOCKS` - 1, shape (K,)."""
         share = self.times / max(float(self.times[-1]), 1e-9)
         return np.asarray(np.minimum((BLOCKS * share).astype(int), BLOCKS - 1))
@@ -188,7 +187,6 @@ def _moved(run: RecordedRun) -> float:
 
 
 Task = tuple[int, ThreadModelSettings]
-Array = NDArray[np.float64]
 
 
 def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> Points:
@@ -225,7 +223,7 @@ def replay_task(runs: Sequence[RecordedRun], task: Task, log: Log, progress: Pro
     return replay_with_parameters(runs[index], settings)
 
 
-def across_residuals(vertices: Points, run: RecordedRun, length: float) -> Array:
+def across_residuals(vertices: Points, run: RecordedRun, length: float) -> Vector:
     """Return how far the nodes are from the thread, measured across the prediction.
 
         r_i = n_i . (x_i - X(s_i)) / L,    n_i across x_{i+1} - x_{i-1}
@@ -249,7 +247,7 @@ def across_residuals(vertices: Points, run: RecordedRun, length: float) -> Array
     return _filled(crossed / (size * length), run.known)
 
 
-def offset_residuals(vertices: Points, run: RecordedRun, length: float) -> Array:
+def offset_residuals(vertices: Points, run: RecordedRun, length: float) -> Vector:
     """Return how far the nodes are from the thread, in both directions, shape (K, 2 n).
 
     For the first fits: far from the solution, a prediction that lies across the thread looks good by
@@ -259,7 +257,7 @@ def offset_residuals(vertices: Points, run: RecordedRun, length: float) -> Array
     return np.concatenate([_filled(offset[..., axis], run.known) for axis in (0, 1)], axis=1)
 
 
-def _filled(values: Array, known: NDArray[np.bool_]) -> Array:
+def _filled(values: Vector, known: Mask) -> Vector:
     """Return 0 where the thread is not known, and 1 where it is not predicted."""
     return np.where(known, np.where(np.isfinite(values), values, 1.0), 0.0)
 

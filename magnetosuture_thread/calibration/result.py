@@ -18,11 +18,6 @@ from magnetosuture_thread.evaluation.metrics import SensorSilence, plain_values
 from magnetosuture_thread.geometry.polyline import Points
 
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
-STIFFNESS = (
-    "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
-    "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
-    "thread's own as far as these are true."
-)
 
 
 @dataclass(frozen=True)
@@ -248,7 +243,11 @@ def _header(calibration: CalibrationResult) -> list[str]:
     if calibration.finished:
         words.append(f"Fitted to {compared}. Intervals are of 95 %.")
     if any(estimate.setting == "elastic_modulus" for estimate in calibration.estimates):
-        words.append(STIFFNESS)
+        words.append(
+            "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. "
+            "elastic_modulus is the one that has the fitted ratio at the viscosity, diameter, thread_length and "
+            "wetted_fraction below; it is the thread's own as far as these are true."
+        )
     return [line for text in words for line in _comment(text)]
 
 

@@ -9,7 +9,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
@@ -44,15 +43,12 @@ from magnetosuture_thread.calibration.result import (
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.evaluation.workers import Log, Progress, TaskRunner
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, Table, Vector
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import Attachment
 
-Array = NDArray[np.float64]
-
 STARTS = tuple(10.0 ** (power / 1.5) for power in range(-3, 4))  # of the material's stiffness
 FLOOR = 2e-3  # of the length, which camera, tracker and model are wrong by
-CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
 MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
 
 
@@ -175,7 +171,7 @@ def _choose_attachment(
 ) -> tuple[FitSolution, AttachmentDecision]:
     """Return the solution whose attachment fits better, or the setup's where that cannot be told."""
 
-    def blocks(solution: FitSolution) -> Array:
+    def blocks(solution: FitSolution) -> Vector:
         """Return the mean distance across the thread in each block of time of each run [% of length]."""
         result = []
         for residual, run in zip(solution.residuals, replays.runs, strict=True):
@@ -245,14 +241,14 @@ class FitSolution:
 
     settings: ThreadModelSettings
     parameters: tuple[Parameter, ...]
-    x: Array
-    residuals: list[Array]
-    jacobian: list[Array]
+    x: Vector
+    residuals: list[Table]
+    jacobian: list[Table]
     scale: float
     cost: float
 
     @property
-    def weights(self) -> list[Array]:
+    def weights(self) -> list[Table]:
         """Weight of each residual: rho'((r / scale)^2) of the robust loss, shape (K, n) for each run."""
         return [1.0 / np.sqrt(1.0 + (r / self.scale) ** 2) for r in self.residuals]
 
@@ -291,13 +287,13 @@ class Objective:
         self._units = np.array([parameter.counts(base) for parameter in parameters])
         self._low, self._high = np.array([parameter.fit_bounds(base) for parameter in parameters]).reshape(-1, 2).T
 
-    def start(self) -> Array:
+    def start(self) -> Vector:
         """Return the numbers of the base, moved inside of their bounds."""
         x = np.array([parameter.to_fit(parameter.read(self.base)) for parameter in self.parameters])
         margin = 0.01 * np.minimum(self._units, self._high - self._low)
         return np.asarray(np.clip(x, self._low + margin, self._high - margin))
 
-    def settings(self, x: Array) -> ThreadModelSettings:
+    def settings(self, x: Vector) -> ThreadModelSettings:
         """Return the settings of some numbers."""
         settings = self.base
         for parameter, number in zip(self.parameters, x.tolist(), strict=True):
@@ -305,14 +301,14 @@ class Objective:
             settings = parameter.write(settings, min(max(parameter.from_fit(number), low), high))
         return settings
 
-    def residuals(self, *points: Array) -> list[list[Array]]:
+    def residuals(self, *points: Vector) -> list[list[Table]]:
         """Return the residuals of each run that counts, at each point."""
         found, length = self._replays.of([self.settings(x) for x in points], self._which), self.base.thread_length
         return [
             [self._residuals(v, run, length) for v, run in zip(vertices, self._runs, strict=True)] for vertices in found
         ]
 
-    def jacobian(self, x: Array) -> list[Array]:
+    def jacobian(self, x: Vector) -> list[Table]:
         """Return derivatives by difference quotients, away from the nearer bound; shape (K, n, P) of each run."""
         # Predictions of `paper` jump by 0.01 % of the length from one number to the next.
         lengths = (0.5 if self.base.formulation == "paper" else 0.01) * self._units
@@ -325,7 +321,7 @@ class Objective:
             for run, begin in enumerate(middle)
         ]
 
-    def fit(self, start: Array | None = None, scale: float = np.inf) -> FitSolution:
+    def fit(self, start: Vector | None = None, scale: float = np.inf) -> FitSolution:
         """Return the best numbers near a start.
 
             min over x  sum rho(r(x)^2 / scale^2),    rho(z) = 2 (sqrt(1 + z) - 1)
@@ -341,10 +337,10 @@ class Objective:
         if self.parameters:  # else only the attachment is asked for
             units = self._units
 
-            def residuals_at(y: NDArray[np.float64]) -> NDArray[np.float64]:
+            def residuals_at(y: Vector) -> Vector:
                 return np.concatenate([part.ravel() for part in self.residuals(first + units * y)[0]])
 
-            def jacobian_at(y: NDArray[np.float64]) -> NDArray[np.float64]:
+            def jacobian_at(y: Vector) -> Vector:
                 parts = [part.reshape(-1, len(first)) for part in self.jacobian(first + units * y)]
                 return np.asarray(units * np.concatenate(parts))
 
@@ -365,7 +361,7 @@ class Objective:
         return FitSolution(self.settings(x), self.parameters, x, residuals, self.jacobian(x), scale, cost)
 
 
-def robust_scale(residuals: Sequence[Array]) -> float:
+def robust_scale(residuals: Sequence[Vector]) -> float:
     """Return the scale of the robust loss: three times the scatter of the residuals, by their median size."""
     sizes = np.abs(np.concatenate([part[part != 0.0] for part in residuals]))
     middle = float(np.median(sizes)) if len(sizes) else 0.0
@@ -451,7 +447,7 @@ class Identifiability(NamedTuple):
 
 def estimate_uncertainty(
     solution: FitSolution, runs: Sequence[RecordedRun], columns: Sequence[int]
-) -> tuple[Array, Array, Array]:
+) -> tuple[Vector, Vector, Table]:
     """Return how well some of a solution's numbers are determined, the others taken as they are.
 
     Args:
@@ -480,10 +476,11 @@ def estimate_uncertainty(
     half = _half(inverse, np.array(blocks))
     if len(runs) >= 3:
         half = np.maximum(half, _half(inverse, np.array(whole)))
-    return half / size + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation
+    # All the time, camera, tracker and model may be wrong alike by 5e-4 of the length.
+    return half / size + 5e-4 / np.maximum(effect, MIN_EFFECT), effect, correlation
 
 
-def _half(inverse: Array, scores: Array) -> Array:
+def _half(inverse: Table, scores: Table) -> Vector:
     """Return half of each 95 % interval by the scores of blocks, shape (G, P)."""
     count = len(scores)
     if count < 2:
@@ -493,7 +490,7 @@ def _half(inverse: Array, scores: Array) -> Array:
     return np.asarray(stdtrit(count - 1, 0.975) * np.sqrt(variance))
 
 
-def _own_effect(flat: Array, weights: Array, index: int) -> float:
+def _own_effect(flat: Table, weights: Vector, index: int) -> float:
     """Return the mean size of a column of the Jacobian, less what the other columns make up for."""
     own, others = flat[:, index], np.delete(flat, index, axis=1)
     if others.shape[1]:

@@ -8,7 +8,6 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.commission import AFTER, BEFORE, PATIENCE, middle_of
 from magnetosuture_thread.calibration.needle_length import find_needle_length
@@ -19,6 +18,7 @@ from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.pulses import MotionGuard, guard_reach
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.rig.closed_loop import LATENCY, POSE_NOISE, START
 from magnetosuture_thread.rig.rig import Rig, RigFrame
@@ -26,8 +26,6 @@ from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.rig.truth import bare_rig
 from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.vision.tracker import State, TrackerSession
-
-Vector = NDArray[np.float64]
 
 
 class SimulatedBench:

@@ -6,15 +6,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings
 
-Vector = NDArray[np.float64]
-
 SIDE, SPEED = 8e-3, 2e-3  # m and m/s
-TIME_SHARE = 3.0  # of the time that the way takes, after which the square has failed
 
 
 class Square:
@@ -39,7 +36,8 @@ class Square:
         bare = {"needle_drag": coils.needle_drag - coils.thread_drag, "thread_drag": 0.0}
         slow = {"without_prediction": "slow", "speed_without_prediction": 2.0 * SPEED}
         self.settings: CoilBridgeSettings = replace(coils, **bare, **slow)  # type: ignore[arg-type]
-        self.time_limit, self._length, self._progress = TIME_SHARE * 4.0 * side / SPEED, coils.needle_length, 0.0
+        self.time_limit = 3.0 * 4.0 * side / SPEED  # three times as long as the way takes
+        self._length, self._progress = coils.needle_length, 0.0
         self._tips: list[Vector] = []
         self._setpoints: list[Vector] = []
 

@@ -7,18 +7,13 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.commission import middle_of
 from magnetosuture_thread.calibration.pulse_model import Pulse
 from magnetosuture_thread.coils.pulses import MAX_TIME, STOOD_STILL
+from magnetosuture_thread.geometry.polyline import Vector
 
-Vector = NDArray[np.float64]
-
-BEGIN = 0.05  # s; after which a pulse is ended
 TO_REST, RESTING = 0.3, 0.7  # s in which a needle comes to rest and frames show it: delays; and in which it rests
-STILL_SHARE, STILL_WAY = 0.2, 5e-5  # of the speed under the current, and m that errors of poses seem to be a way
-FEWEST_POSES = 5  # that show whether a needle rests
 TRIES = 3  # a busy computer may disturb a pulse too late, or stand still itself
 
 
@@ -92,7 +87,7 @@ def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[
                 log(f"{name}: not checked from here: end the bridge by kill -9 while a current flows")
                 break
             hold = RESTING + (0.0 if ended else bench.driver_timeout + TO_REST)
-            pulse, begun, over = bench.disturbed_pulse(currents, MAX_TIME, BEGIN, disturbance, hold)
+            pulse, begun, over = bench.disturbed_pulse(currents, MAX_TIME, 0.05, disturbance, hold)  # s
             bench.recover(causes)
             problem = "" if ended in pulse.ended else f"currents ended by {pulse.ended or 'their time'}"
             tries = tries - 1 if problem else 0
@@ -109,7 +104,8 @@ def check_stops(bench: StopBench, currents: Vector, speed: float, log: Callable[
 
 def _moving(middles: Vector, speed: float) -> str:
     """Return how a needle that should rest moves, by its middles, shape (k, 2) [m]; empty if it rests."""
-    if len(middles) < FEWEST_POSES:
+    if len(middles) < 5:
         return "too few poses show whether the needle rests"
     way = float(np.hypot(*(middles[-1] - middles[0])))
-    return f"the needle moves on, by {1e3 * way:.2f} mm" if way > STILL_WAY + STILL_SHARE * speed * RESTING else ""
+    allowed = 5e-5 + 0.2 * speed * RESTING  # m; errors of poses, and a share of the way under the current
+    return f"the needle moves on, by {1e3 * way:.2f} mm" if way > allowed else ""
