@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.report import figures_table
 from magnetosuture_thread.bags.reading import pose_deviation
 from magnetosuture_thread.commands.command import Terminal
-from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.estimator.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, lay_behind_needle, points_at

@@ -23,7 +23,7 @@ from benchmarks.closed_loop import LoopRecord, Vector
 from benchmarks.report import figures_table
 from magnetosuture_thread import Disc, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
 from magnetosuture_thread.commands.command import Terminal
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.executor import ENDED, ThreadCondition

@@ -12,14 +12,14 @@ if TYPE_CHECKING:  # under an alias, so that type checkers take each name for on
     from magnetosuture_thread.calibration.bags import calibrate_bags as calibrate_bags
     from magnetosuture_thread.coils.filter import FilteredCommand as FilteredCommand
     from magnetosuture_thread.coils.filter import NeedleSafetyFilter as NeedleSafetyFilter
-    from magnetosuture_thread.estimator import EstimatorOptions as EstimatorOptions
-    from magnetosuture_thread.estimator import EstimatorSession as EstimatorSession
-    from magnetosuture_thread.estimator import ThreadEstimate as ThreadEstimate
-    from magnetosuture_thread.estimator import ThreadEstimator as ThreadEstimator
+    from magnetosuture_thread.estimator.estimator import EstimatorOptions as EstimatorOptions
+    from magnetosuture_thread.estimator.estimator import EstimatorSession as EstimatorSession
+    from magnetosuture_thread.estimator.estimator import ThreadEstimate as ThreadEstimate
+    from magnetosuture_thread.estimator.estimator import ThreadEstimator as ThreadEstimator
     from magnetosuture_thread.evaluation.replay import replay_offline as replay_offline
-    from magnetosuture_thread.forecast import Forecast as Forecast
-    from magnetosuture_thread.forecast import ForecastStart as ForecastStart
-    from magnetosuture_thread.forecast import ThreadForecaster as ThreadForecaster
+    from magnetosuture_thread.forecast.forecaster import Forecast as Forecast
+    from magnetosuture_thread.forecast.forecaster import ForecastStart as ForecastStart
+    from magnetosuture_thread.forecast.forecaster import ThreadForecaster as ThreadForecaster
     from magnetosuture_thread.geometry.barrier import Barrier as Barrier
     from magnetosuture_thread.geometry.barrier import Gradient as Gradient
     from magnetosuture_thread.geometry.barrier import check_gradient as check_gradient
@@ -51,11 +51,11 @@ __version__ = "0.2.0"  # as in pyproject.toml, both files package.xml, CITATION.
 _HOME = {
     "geometry.barrier": ("Barrier", "Gradient", "check_gradient"),
     "settings.errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
-    "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
+    "forecast.forecaster": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
     "calibration.bags": ("calibrate_bags",),
     "evaluation.replay": ("replay_offline",),
-    "estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
+    "estimator.estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "thread.margins": ("BarrierMargins", "Margins"),
     "thread.paper": ("PaperOptions",),
     "thread.prediction": ("NeedlePose", "Prediction"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.rig.dynamics import NeedleBody
 from magnetosuture_thread.rig.setups import read_setup

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from magnetosuture_thread.coils.bridge import BridgeOutput
     from magnetosuture_thread.coils.coil_system import CoilSystem
     from magnetosuture_thread.coils.drivers import DriverState
-    from magnetosuture_thread.estimator import ThreadEstimate
+    from magnetosuture_thread.estimator.estimator import ThreadEstimate
     from magnetosuture_thread.estimator.thread_session import PredictionResult
-    from magnetosuture_thread.forecast import Forecast
+    from magnetosuture_thread.forecast.forecaster import Forecast
     from magnetosuture_thread.vision.tracker import Track
 
 Vector = NDArray[np.float64]

@@ -11,7 +11,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings
 
-SIDE, SPEED = 8e-3, 2e-3  # m and m/s
+SPEED = 2e-3  # m/s
 
 
 class Square:
@@ -28,7 +28,7 @@ class Square:
     """
 
     def __init__(self, coils: CoilBridgeSettings, dish_radius: float) -> None:
-        side = min(SIDE, 0.5 * dish_radius)
+        side = min(8e-3, 0.5 * dish_radius)  # m
         corners = 0.5 * side * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1], [1, -1]])
         needle = {"needle_length": coils.needle_length, "speed": SPEED, "settle": 0.0}
         waypoints = tuple(corners.ravel().tolist())

@@ -10,7 +10,7 @@ from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.commands.command import Terminal
 from magnetosuture_thread.estimator.thread_session import ThreadSession
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.planning.session import compile_planning

@@ -37,7 +37,6 @@ from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, 
 from magnetosuture_thread.thread.rod import STRAIN_TOLERANCE, RodFormulation, segment_rows
 from magnetosuture_thread.thread.solvers import BandedSolver
 
-MAX_SOLVES = 8  # of a correction
 RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
 NEIGHBOURS = 2  # on each side of a point, that it is compared with
@@ -299,7 +298,7 @@ def correct(
         contacts, depth = contact_rows(buffers, row, workspace, about, start, 1.0, rod.unit, rod.radius, True)
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         done = off <= 1.0 and change <= CHANGED and largest <= RESIDUAL_TOLERANCE
-        if contacts < 0 or (solves > 0 and (done or solves >= MAX_SOLVES)):
+        if contacts < 0 or (solves > 0 and (done or solves >= 8)):
             break
         for r in range(segments, row):
             buffers.multipliers[r] = 0.0

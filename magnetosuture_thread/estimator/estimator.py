@@ -410,15 +410,16 @@ class ThreadEstimator:
         added = formulation.added.rows_at(pose.stamp, positions, pose.heading)
 
         def compute_margins() -> Margins:
-            margins, bounds = formulation.margins(positions, pose.heading), dict[str, Vector]()
-            for solid in margins:
-                if solid.barrier in SOLID:
-                    nodes, gradient = solid.node[:, None], solid.normal[:, None]
-                    bounds[solid.barrier] = clearance_bound(nodes, gradient, solid.clearance, covariance, True)
-            for rows in added:
-                bounds[rows.name] = clearance_bound(rows.nodes, rows.gradient, rows.clearance, covariance)
-            margins += map(BarrierMargins.from_rows, added)
-            return Margins.of(margins, tolerance, prediction.scene_version).with_bounds(bounds)
+            margins = []
+            for each in formulation.margins(positions, pose.heading):
+                if each.barrier in SOLID:
+                    rows = each.node[:, None], each.normal[:, None], each.clearance
+                    each = replace(each, bound=clearance_bound(*rows, covariance, True))
+                margins.append(each)
+            for row in added:
+                bound = clearance_bound(row.nodes, row.gradient, row.clearance, covariance)
+                margins.append(replace(BarrierMargins.from_rows(row), bound=bound))
+            return Margins.of(margins, tolerance, prediction.scene_version)
 
         return ThreadEstimate(
             prediction=prediction,

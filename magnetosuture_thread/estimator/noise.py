@@ -30,7 +30,6 @@ GRID = 10.0 ** np.arange(-17.0, -5.5)
 QUIET = 1e-14  # before anything is measured [m^2/s]
 NOISE_TIME = 1.0  # s; over which likelihoods of intensities are forgotten
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
-SURE = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -233,13 +232,7 @@ def learn_intensity(
 
 
 def raised_intensity(
-    error: Points,
-    variance: Points,
-    likelihood: Points,
-    intensity: Vector,
-    seen: Mask,
-    interval: float,
-    settled: bool,
+    error: Points, variance: Points, likelihood: Points, intensity: Vector, seen: Mask, interval: float, settled: bool
 ) -> Vector:
     """Return the process noise of each window, with what must have come at once where it did not explain an error.
 
@@ -261,7 +254,8 @@ def raised_intensity(
     # Of 99 % of right models it is less.
     if settled and (left[tested] / doubt[tested]).sum() > 2.0 * count:
         common = np.maximum(left - doubt, 0.0).sum() / count
-    return np.maximum(intensity + np.maximum(left - SURE**2 * doubt, 0.0) / interval, common / interval)
+    # An error of up to three standard deviations is explained.
+    return np.maximum(intensity + np.maximum(left - 9.0 * doubt, 0.0) / interval, common / interval)
 
 
 def take_correction(

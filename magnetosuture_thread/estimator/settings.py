@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.estimator.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
 from magnetosuture_thread.geometry.barrier import Barrier, load_barriers
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings import shared_parameters as shared

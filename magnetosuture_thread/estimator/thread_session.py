@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.estimator import observation_of
+from magnetosuture_thread.estimator.estimator import ThreadEstimate, observation_of
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.polyline import Points, Vector, lay_behind_needle
 from magnetosuture_thread.geometry.scene import Scene
@@ -73,7 +72,7 @@ class PredictionResult:
         if thread is None or self.law is None or not thread.converged:
             return None
         margins = thread.margins
-        return margins.with_friction(self.law.classify(margins, self.speeds))
+        return replace(margins, friction=self.law.classify(margins, self.speeds))
 
     @property
     def reason(self) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.bags.reading import margins_of, nanoseconds, plane_points, thread_observation
-from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.estimator.disturbance import Disturbance
+from magnetosuture_thread.estimator.estimator import ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.thread_observation import ThreadObservation

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from magnetosuture_thread.coils.filter import NeedleSafetyFilter
-from magnetosuture_thread.estimator import ThreadEstimate
+from magnetosuture_thread.estimator.estimator import ThreadEstimate
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.rollout import (
     KINDS,
@@ -19,7 +19,6 @@ from magnetosuture_thread.forecast.rollout import (
     OBSTACLE_MARGIN,
     WALL_MARGIN,
     DragData,
-    empty_margins,
     least_margins,
     nodes_under_friction,
     step_needle,
@@ -481,7 +480,9 @@ class ThreadForecaster:
         slowdown, rubbed = np.ones(instants), np.zeros((instants, nodes), np.bool_)
         tension, pull = np.zeros((instants, nodes - 1)), np.zeros((instants, 2))
         touched = np.zeros((instants, len(self._names)), np.bool_)
-        margin, margin_nodes, margin_shapes = empty_margins(instants)
+        kinds = instants, len(KINDS)
+        margin, margin_nodes = np.full(kinds, np.inf), np.zeros(kinds, np.int64)
+        margin_shapes = np.full(kinds, NO_SHAPE)
         added, known = np.zeros(3), start.needle_force is not None
         if start.needle_force is not None:
             pull[0] = start.needle_force

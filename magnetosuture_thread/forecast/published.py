@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
-from magnetosuture_thread.estimator import ThreadEstimate
+from magnetosuture_thread.estimator.estimator import ThreadEstimate
 from magnetosuture_thread.forecast.forecaster import Forecast, ForecastStart, ThreadForecaster
 from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, Vector

@@ -15,7 +15,6 @@ from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceDat
 from magnetosuture_thread.geometry.polyline import Indices, Mask, Points, Table, Vector
 from magnetosuture_thread.thread.barriers import link_margins
 from magnetosuture_thread.thread.mechanics import RodProperties
-from magnetosuture_thread.thread.program import NO_SHAPE
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins of a forecast."""
@@ -210,10 +209,3 @@ def least_margins(
                 if clearance < least[kind]:
                     least[kind], node[k, kind], shape[k, kind] = clearance, i, o
     return True
-
-
-def empty_margins(instants: int) -> tuple[Table, Indices, Indices]:
-    """Return margins that are of nothing, their nodes and shapes, each of shape (k, 5)."""
-    kinds = instants, len(KINDS)
-    nodes: Indices = np.zeros(kinds, np.int64)
-    return np.full(kinds, np.inf), nodes, np.full(kinds, NO_SHAPE)

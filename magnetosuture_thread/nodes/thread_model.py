@@ -33,7 +33,7 @@ from magnetosuture_thread.bags.packing import (
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.estimator.thread_session import WAITING, PredictionResult, ThreadSession
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower

@@ -46,13 +46,11 @@ from magnetosuture_thread.settings.errors import SolverError
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
 MU_0 = 4e-7 * math.pi  # T m/A
-SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
-MAX_HALVINGS = 8
 MIN_PART = 1e-6  # of Newton's move, below which the line search ends
 MAX_ITERATIONS = 60  # of Newton in a step
-CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
+CONTACTS_PER_NODE = 8  # rows of contact with surfaces
 
 
 class CoilField:
@@ -456,7 +454,7 @@ class RigDynamics:
         radius = 0.5 * needle.diameter + surface.skin
         self._needle = Needle(needle.resistance, needle.tip, needle.pole, outline, radius, clamp)
         self._rows = np.empty((CONTACTS_PER_NODE * (thread.segments + 1), 6))
-        self._pairs = np.empty((PAIRS_PER_NODE * (thread.segments + 1), 6))
+        self._pairs = np.empty((16 * (thread.segments + 1), 6))  # rows of contact of the thread with itself
         self._move, self._held = 0.0, np.zeros(0)
         self.time = self.residual = 0.0
         self.iterations = self.halvings = 0
@@ -570,7 +568,7 @@ class RigDynamics:
                 done, h, tries = done + h, regular, 0
                 continue
             tries += 1
-            if tries > MAX_HALVINGS:
+            if tries > 8:
                 raise SolverError("rig", "no convergence", self._move, TOLERANCE)
             self.halvings += 1
             h *= 0.5
@@ -618,7 +616,7 @@ class RigDynamics:
             drag=drag_matrices(trial, rod, scale),
             turned=scale * turn @ needle.resistance @ turn.T,
             field=flux,
-            slip=SLIP_SPEED * h,
+            slip=2e-6 * h,  # m/s; what should stick by friction creeps, at less than this speed
             rows=rows,
         )
         iterations, self._move, residual = minimise(trial, Bodies(needle, rod, shapes), terms, currents is None)

@@ -30,7 +30,6 @@ import numpy as np
 from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
-PRIORITY = 11  # of SCHED_FIFO, where permitted: above what nodes have by default
 ACKNOWLEDGED = b"\xff"
 ADDRESSES = range(0x80, 0x88)
 
@@ -458,8 +457,8 @@ def _serve(pipe: Connection, ports: Sequence[str], supply: float, resistance: fl
     """Open a stage, send how that went, and its charges as often as asked, until nobody can ask any more."""
     os.setsid()  # Ctrl-C is for the rig, which then takes the boards away
     with suppress(OSError):  # only some may
-        # Before the nodes, with which boards would not share a processor; threads inherit it.
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        # Above what nodes have by default, with which boards would not share a processor; threads inherit it.
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(11))
     stage = PowerStage(ports, supply, resistance, inductance)
     try:
         stage.open()

@@ -17,7 +17,7 @@ contacts.
 **Friction** follows Coulomb's law with the normal forces at the start of a step. A contact that pushes with the force N
 adds, for its slip s along the tangent since then,
 
-    mu N (sqrt(s^2 + e^2) - e),    e = SLIP_SPEED dt
+    mu N (sqrt(s^2 + e^2) - e),    e = (2 um/s) dt
 
 to the energy of the step: a force of mu N s / sqrt(s^2 + e^2) against the slip.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any
@@ -171,17 +171,6 @@ class Margins(Mapping[str, BarrierMargins]):
     def minima(self) -> tuple[BarrierMargins, ...]:
         """The row of least clearance of each barrier that has rows, as margins of one row; its bound is the least."""
         return tuple(_row(margins, margins.closest) for margins in self.barriers if len(margins))
-
-    def with_bounds(self, bounds: Mapping[str, Vector]) -> Margins:
-        """Return the same margins with bounds of the clearances of some barriers [m], by name."""
-        barriers = tuple(
-            replace(each, bound=bounds[each.barrier]) if each.barrier in bounds else each for each in self.barriers
-        )
-        return replace(self, barriers=barriers)
-
-    def with_friction(self, friction: Friction) -> Margins:
-        """Return the same margins with the thread's friction."""
-        return replace(self, friction=friction)
 
     @classmethod
     def of(cls, barriers: Sequence[BarrierMargins], contact_tolerance: float, scene_version: str = "") -> Margins:

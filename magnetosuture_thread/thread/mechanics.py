@@ -62,14 +62,7 @@ class RodProperties(NamedTuple):
 
 
 @compiled_inner
-def metric(
-    positions: Points,
-    weights: Vector,
-    inertia: float,
-    across: float,
-    along: float,
-    blocks: Table,
-) -> None:
+def metric(positions: Points, weights: Vector, inertia: float, across: float, along: float, blocks: Table) -> None:
     """Write the metric Z_i of each node.
 
         Z_i = w_i (inertia + across (I - t_i t_i') + along t_i t_i')

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.estimator import Disturbance, EstimatorOptions, EstimatorSession, ThreadEstimator
 from magnetosuture_thread.estimator.association import MeasuredPoints
 from magnetosuture_thread.estimator.correction import Corrector, Prior, prior_information
-from magnetosuture_thread.estimator.disturbance import BendingRelaxation, DisturbanceTest
+from magnetosuture_thread.estimator.disturbance import BendingRelaxation, Disturbance, DisturbanceTest
+from magnetosuture_thread.estimator.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import points_at
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece

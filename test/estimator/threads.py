@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.estimator import ThreadEstimator
+from magnetosuture_thread.estimator.estimator import ThreadEstimator
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from magnetosuture_thread.estimator import Disturbance
+from magnetosuture_thread.estimator.disturbance import Disturbance
 from magnetosuture_thread.evaluation import metrics
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.thread.margins import BarrierMargins, Margins

@@ -23,7 +23,7 @@ from magnetosuture_thread import (
     ThreadForecaster,
     ThreadPredictor,
 )
-from magnetosuture_thread.forecast import NeedleDrag
+from magnetosuture_thread.forecast.forecaster import NeedleDrag
 from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.thread.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.thread.material import MATERIALS, Attachment

@@ -21,7 +21,7 @@ from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import packed_path
 from magnetosuture_thread.bags.reading import path_poses
 from magnetosuture_thread.coils.needle_motion import NeedleKinematics
-from magnetosuture_thread.estimator import ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.estimator.estimator import ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.settings.interface import PROCEDURE_PLAN

@@ -19,7 +19,8 @@ from rclpy.serialization import serialize_message
 from magnetosuture_thread.bags import packing, reading
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.packing import packed_scene
-from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.estimator.disturbance import Disturbance
+from magnetosuture_thread.estimator.estimator import ThreadEstimate
 from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc

@@ -48,7 +48,7 @@ def test_the_bound_counts_where_it_is_to_and_where_there_is_one():
     margins, by_bound = barriers(*GATE), replace(LAW, threshold=0.95e-3, by_bound=True)
     avoided = margins["obstacle"]
     assert by_bound.classify(margins, np.ones(8)).nodes == ()
-    bounded = margins.with_bounds({"obstacle": avoided.clearance - 2e-5})
+    bounded = {**margins, "obstacle": replace(avoided, bound=avoided.clearance - 2e-5)}
     assert by_bound.classify(bounded, np.ones(8)).nodes == (3, 4)
     assert replace(by_bound, by_bound=False).classify(bounded, np.ones(8)).nodes == ()
 

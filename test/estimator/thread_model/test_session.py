@@ -11,7 +11,7 @@ import pytest
 
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import NeedleMotionFilter, PredictionResult, ThreadSession
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene

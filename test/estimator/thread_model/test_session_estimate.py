@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.estimator import ThreadEstimate
+from magnetosuture_thread.estimator.estimator import ThreadEstimate
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.estimator.thread_session import PredictionResult, ThreadSession
 from magnetosuture_thread.geometry.obstacles import Disc
