@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import CoilProperties, loop_fields
+from magnetosuture_thread.geometry.polyline import Indices, Points, Vector
 from magnetosuture_thread.settings.configuration import (
     Quantity,
     bounded,
@@ -106,8 +106,6 @@ def _coil_from(where: str, values: Any) -> CoilProperties:
         raise ConfigurationError(error.name.replace("coil", where, 1), error.value, error.expectation) from None
 
 
-Array = NDArray[np.float64]
-
 # Of the numbers of a line; beyond, they are assumed to have another unit.
 QUANTITIES = {
     "current": bounded("A", -1000.0, 1000.0),
@@ -115,7 +113,6 @@ QUANTITIES = {
     **dict.fromkeys(("bx", "by"), bounded("T", -1.0, 1.0)),
 }
 COLUMNS = ("coil", *QUANTITIES)
-MAX_COILS = 64
 MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
 MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
 # Standard deviations, of the angle in rad, of the others relative, in the order of `PARAMETERS`: above, a parameter is
@@ -140,11 +137,11 @@ class ProbeMeasurements:
 
     source: str
     names: tuple[str, ...]
-    coil: NDArray[np.int64]
-    current: NDArray[np.float64]
-    points: NDArray[np.float64]
-    field: NDArray[np.float64]
-    lines: NDArray[np.int64]
+    coil: Indices
+    current: Vector
+    points: Points
+    field: Points
+    lines: Indices
 
 
 def read_measurements(path: Path) -> ProbeMeasurements:
@@ -203,8 +200,8 @@ def _number(where: str, text: str, limits: Quantity) -> float:
 def _ordered_names(named: list[str], path: Path) -> tuple[str, ...]:
     """Return the coils' names in the order of their currents."""
     names = list(dict.fromkeys(named))
-    if len(names) > MAX_COILS:
-        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", f"at most {MAX_COILS}")
+    if len(names) > 64:
+        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", "at most 64")
     if not all(name.startswith("coil_") and _is_index(name.removeprefix("coil_")) for name in names):
         return tuple(names)
     wanted = [f"coil_{k}" for k in range(len(names))]
@@ -230,9 +227,9 @@ class CalibrationFit:
     """
 
     calibration: CoilCalibration
-    deviations: Array
+    deviations: Vector
     poor: tuple[tuple[str, ...], ...]
-    background: Array
+    background: Vector
     residual: float
     worst: tuple[int, float]
     readings: int
@@ -270,7 +267,7 @@ def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
     low = [-math.inf, math.log(nearest), math.log(radii.minimum), -math.inf] * count + [-math.inf] * 2
     high = [math.inf, math.log(farthest), math.log(radii.maximum), math.inf] * count + [math.inf] * 2
 
-    def residuals(x: Array) -> Array:
+    def residuals(x: Vector) -> Vector:
         """Return the differences in units of the field's size, of numbers of order one; see `_start`."""
         angle, distance, radius, strength = x[:-2].reshape(-1, 4).T[:, data.coil]
         axis = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -300,15 +297,9 @@ def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
     poor = tuple(_exceeding(share, POOR_DEVIATION) for share in shares)
     distances = np.linalg.norm(difference, axis=1)
     worst = int(np.argmax(distances))
-    return CalibrationFit(
-        CoilCalibration("", "", "", coils),
-        shares * sizes,
-        poor,
-        size * found.x[-2:],
-        residual,
-        (int(data.lines[worst]), float(distances[worst])),
-        len(distances),
-    )
+    farthest_off, calibration = (int(data.lines[worst]), float(distances[worst])), CoilCalibration("", "", "", coils)
+    background = size * found.x[-2:]
+    return CalibrationFit(calibration, shares * sizes, poor, background, residual, farthest_off, len(distances))
 
 
 def _check_readings(data: ProbeMeasurements) -> None:
@@ -323,7 +314,7 @@ def _check_readings(data: ProbeMeasurements) -> None:
         raise InvalidInputError(f"{data.source}, bx and by", "less than 1e-6 T everywhere", "the field of coils in T")
 
 
-def _start(data: ProbeMeasurements, index: int, background: Array, size: float) -> Array:
+def _start(data: ProbeMeasurements, index: int, background: Vector, size: float) -> Vector:
     """Return angle, log distance, log radius and field / size of a coil, roughly, by its own readings."""
     on = (data.coil == index) & (data.current != 0.0)
     points, per_current = data.points[on], (data.field[on] - background) / data.current[on, None]
@@ -339,7 +330,7 @@ def _start(data: ProbeMeasurements, index: int, background: Array, size: float) 
     return np.array([angle, math.log(distance), math.log(0.5 * distance), sign * strength / size])
 
 
-def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference: Array) -> CoilProperties:
+def _coil(data: ProbeMeasurements, index: int, x: Vector, size: float, difference: Vector) -> CoilProperties:
     """Return a coil from its parameters."""
     angle, distance, radius, field = x[4 * index : 4 * index + 4]
     farthest = int(np.argmax(np.hypot(*data.points.T)))
@@ -358,7 +349,7 @@ def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference
         raise InvalidInputError(f"{data.source}, {name}", error.value, error.expectation) from None
 
 
-def _deviations(data: ProbeMeasurements, jacobian: Array, residual: float) -> Array:
+def _deviations(data: ProbeMeasurements, jacobian: Vector, residual: float) -> Vector:
     """Return standard deviations of the numbers of `_start`, shape (m, 4); reject unidentifiable parameters."""
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, values, turned = np.linalg.svd(jacobian / scale, full_matrices=False)
@@ -374,6 +365,6 @@ def _deviations(data: ProbeMeasurements, jacobian: Array, residual: float) -> Ar
     return np.asarray(deviations[:-2].reshape(-1, 4))
 
 
-def _exceeding(shares: Array, limits: Sequence[float]) -> tuple[str, ...]:
+def _exceeding(shares: Vector, limits: Sequence[float]) -> tuple[str, ...]:
     """Return the parameters of a coil whose standard deviation, as a share but of the angle, exceeds its limit."""
     return tuple(name for name, share, most in zip(PARAMETERS, shares, limits, strict=True) if share > most)
