@@ -26,7 +26,6 @@ Box = tuple[slice, slice]
 OVERSAMPLING = 4
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
-LIGHT_BGR = (0.955, 0.985, 1.0)
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 REACH_PX = 24.0  # of shadows and blur around what moves
@@ -285,7 +284,8 @@ class DishCamera:
         # The two edges of the rim, and the light between them; the inner one is where other frames of a dish have it.
         for beyond, spread, depth in ((0.199e-3, 0.21e-3, -145.0), (0.98e-3, 0.18e-3, -100.0), (0.6e-3, 0.15e-3, 22.0)):
             light += depth * np.exp(-(((away - radius - beyond) / spread) ** 2))
-        image = np.asarray(light[:, :, None] * np.array(LIGHT_BGR, np.float32), dtype=np.float32)
+        lamp = np.array((0.955, 0.985, 1.0), np.float32)  # its colour
+        image = np.asarray(light[:, :, None] * lamp, dtype=np.float32)
         looks = scene.looks or [LOOKS["silicone"]] * len(scene.obstacles)
         for obstacle, look in zip(scene.obstacles, looks, strict=True):
             self._add_obstacle(image, obstacle, look)

@@ -19,28 +19,9 @@ from magnetosuture_thread.coils.field import fields_per_current
 from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points, Vector, chain_along
+from magnetosuture_thread.rig import rod as elastic
 from magnetosuture_thread.rig.contact import Shapes, Surface, clear, point_contacts
-from magnetosuture_thread.rig.rod import (
-    WIDTH,
-    NeedleJoint,
-    Rod,
-    StepTerms,
-    System,
-    ThreadProperties,
-    add_bending,
-    add_contact,
-    add_drag,
-    add_rows,
-    add_stretching,
-    back_substitute,
-    couple,
-    crossings,
-    drag_matrices,
-    factor,
-    find_contacts,
-    find_friction,
-    find_pairs,
-)
+from magnetosuture_thread.rig.rod import WIDTH, NeedleJoint, Rod, StepTerms, System, ThreadProperties
 from magnetosuture_thread.settings.errors import SolverError
 
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
@@ -303,10 +284,11 @@ def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System
     g, band, rows = system.gradient, system.band, system.contacts
     g[:] = 0.0
     band[:, :] = 0.0
-    energy = add_drag(q, terms.rest, terms.drag, g, band)
-    energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band)
-    energy += add_contact(q, shapes.stiffness, rows[: find_contacts(q, rod, shapes, rows)], g, band, convex)
-    energy += add_rows(q, terms, rod, shapes.stiffness, system)
+    energy = elastic.add_drag(q, terms.rest, terms.drag, g, band)
+    energy += elastic.add_stretching(q, rod, g, band, convex) + elastic.add_bending(q, rod, g, band)
+    contacts = rows[: elastic.find_contacts(q, rod, shapes, rows)]
+    energy += elastic.add_contact(q, shapes.stiffness, contacts, g, band, convex)
+    energy += elastic.add_rows(q, terms, rod, shapes.stiffness, system)
     energy += add_clamp(q, bodies.needle, rod.segment, g, band, convex)
     if not driven:
         return energy + add_needle(q, bodies, terms, system, convex)
@@ -360,14 +342,14 @@ def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> t
     force = _largest(gradient, 1.0 / lever)
     for iteration in range(1, MAX_ITERATIONS + 1):
         chol = system.band.copy()
-        if not factor(chol):
+        if not elastic.factor(chol):
             _assemble_energy(current, bodies, terms, system, driven, True)
             chol = system.band.copy()
-            if not factor(chol):
+            if not elastic.factor(chol):
                 return -1, np.inf, force
         step = -gradient
-        back_substitute(chol, step)
-        couple(chol, terms.rows, system.second, 3 if driven else 0, step)
+        elastic.back_substitute(chol, step)
+        elastic.couple(chol, terms.rows, system.second, 3 if driven else 0, step)
         slope, move = float(np.dot(gradient, step)), _largest(step, lever)
         rounding = 1e-10 * abs(energy) + 1e-18  # J; the energy is a sum of larger terms, or moves by the tolerance
         if not max(abs(slope), move) < np.inf:
@@ -603,24 +585,24 @@ class RigDynamics:
         scale = (1.0 + 2.0 * w) / ((1.0 + w) * h)  # 1 / (beta dt)
         rows, crossed = np.empty((0, 6)), np.empty((0, 0), np.bool_)
         if shapes.self_contact:
-            crossed = crossings(q)
-            if (pairs := find_pairs(q, rod, shapes, crossed, self._pairs)) < 0:
+            crossed = elastic.crossings(q)
+            if (pairs := elastic.find_pairs(q, rod, shapes, crossed, self._pairs)) < 0:
                 return False
             rows = self._pairs[:pairs]
         if shapes.friction > 0.0:
-            contacts = self._rows[: find_contacts(q, rod, shapes, self._rows)]
-            rows = np.vstack([rows, find_friction(contacts, shapes)])
+            contacts = self._rows[: elastic.find_contacts(q, rod, shapes, self._rows)]
+            rows = np.vstack([rows, elastic.find_friction(contacts, shapes)])
         terms = StepTerms(
             begin=q,
             rest=((1.0 + w) ** 2 * q - w**2 * before) / (1.0 + 2.0 * w),
-            drag=drag_matrices(trial, rod, scale),
+            drag=elastic.drag_matrices(trial, rod, scale),
             turned=scale * turn @ needle.resistance @ turn.T,
             field=flux,
             slip=2e-6 * h,  # m/s; what should stick by friction creeps, at less than this speed
             rows=rows,
         )
         iterations, self._move, residual = minimise(trial, Bodies(needle, rod, shapes), terms, currents is None)
-        if iterations < 0 or (shapes.self_contact and (crossings(trial) & ~crossed).any()):
+        if iterations < 0 or (shapes.self_contact and (elastic.crossings(trial) & ~crossed).any()):
             return False
         self._before, self._q, self._last_dt = q, trial, h
         self.time, self.residual, self.iterations = self.time + h, residual, self.iterations + iterations

@@ -176,11 +176,12 @@ class RoboClawBoard:
             self.timeline.append((time, duties))
 
     def _handle(self, packet: bytes) -> bytes:
-        """Return the answer to a packet, once it is done what it asks for."""
+        """Return the answer to a packet, once it is done what it asks for; a question's has a checksum of both."""
         command = packet[1]
         if command not in ARGUMENTS:
             self.heard = self._time
-            return answer(self.address, command, self._data(command))
+            data = self._data(command)
+            return data + struct.pack(">H", checksum(bytes((self.address, command)) + data))
         if checksum(packet[:-2]) != struct.unpack(">H", packet[-2:])[0]:
             return b""
         self.heard = self._time
@@ -235,11 +236,6 @@ def checksum(data: bytes) -> int:
     '0x31c3'
     """
     return binascii.crc_hqx(data, 0)
-
-
-def answer(address: int, command: int, data: bytes) -> bytes:
-    """Return the answer to a question: data, and the checksum over the question and the data."""
-    return data + struct.pack(">H", checksum(bytes((address, command)) + data))
 
 
 class Line:
