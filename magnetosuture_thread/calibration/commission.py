@@ -46,13 +46,6 @@ class Bench(Protocol):
             InvalidInputError: there is no pose, and why.
         """
 
-    def follow_square(self, coils: CoilBridgeSettings) -> tuple[float, str]:
-        """Steer the needle slowly around a square by a coil bridge with such settings.
-
-        Returns:
-            The largest distance from it [m], and why its end was not reached; empty if it was.
-        """
-
 
 @dataclass(frozen=True)
 class CoilAnswer:
@@ -172,7 +165,7 @@ class Commissioning:
             if not sum(self._designed(model, top, 8) for _ in range(6)):
                 break
             model.fit(self._pulses)
-            wide = self._wide(model)
+            wide = [name for name, width in model.intervals.items() if width > KINDS[kind_of(name)][1]]
             history.append((len(self._pulses), *self._intervals(model)))
             _, angle, gain, drag, delay = history[-1]
             known = (
@@ -355,16 +348,10 @@ class Commissioning:
         way = max(self._motion(pulse)[0], 3e-4)  # m; as a shorter one is measured to some micrometres
         return float(np.hypot(*error)) / way, abs(float(predicted[2] - measured[2]))
 
-    def _wide(self, model: PulseModel) -> list[str]:
-        """Return the parameters that are not known well enough."""
-        wide = 1.96 * model.deviations
-        return [name for name, w in zip(model.names, wide.tolist(), strict=True) if w > KINDS[kind_of(name)][1]]
-
     def _intervals(self, model: PulseModel) -> tuple[float, float, float, float]:
         """Return the widest intervals of coil directions, strengths, drags and the delay; see `Commissioned`."""
-        wide = dict(zip(model.names, (1.96 * model.deviations).tolist(), strict=True))
-        kinds = ("angle", "field", "drag", "delay")
-        angle, gain, drag, delay = (max(w for name, w in wide.items() if kind in name) for kind in kinds)
+        kinds, widths = ("angle", "field", "drag", "delay"), model.intervals.items()
+        angle, gain, drag, delay = (max(width for name, width in widths if kind in name) for kind in kinds)
         return angle, gain, drag, DELAY_UNIT * delay
 
     def _changes(self, rig: RigParameters) -> list[str]:

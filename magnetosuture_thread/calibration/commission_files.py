@@ -81,10 +81,6 @@ class RecordedBench:
         self.reused += 1
         return pulse
 
-    def follow_square(self, coils: CoilBridgeSettings) -> tuple[float, str]:
-        """Steer the needle around a square; see `Bench`."""
-        return self._bench.follow_square(coils)
-
     def _path(self, index: int) -> Path:
         return self._folder / f"{index:03d}"
 
@@ -203,7 +199,7 @@ def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]
     """
     assert result.model is not None
     rig, needle, coils = result.model.parameters, believed.needle(), believed.coils_properties()
-    wide = dict(zip(result.model.names, (1.96 * result.model.deviations).tolist(), strict=True))
+    wide = result.model.intervals
     values = []
     for k, coil in enumerate(coils):
         angle, strength = math.remainder(float(rig.angles[k]), math.tau), float(rig.fields[k])
@@ -316,13 +312,22 @@ def read_rig(folder: Path, believed: CoilBridgeSettings) -> RigParameters:
         raise ConfigurationError("values", f"no {error}", "those of this setup's coils", str(path)) from None
 
 
-def verify_square(result: Commissioned, setup: Setup, bench: Bench) -> Commissioned:
-    """Let the needle follow a square with the setup that would be written; return the result with what came of it."""
+def verify_square(
+    result: Commissioned, setup: Setup, follow_square: Callable[[CoilBridgeSettings], tuple[float, str]]
+) -> Commissioned:
+    """Let the needle follow a square with the setup that would be written; return the result with what came of it.
+
+    Args:
+        result: of the pulses.
+        setup: that was believed.
+        follow_square: steers the needle slowly around it by a coil bridge with such settings; returns the largest
+            distance from it [m], and why its end was not reached, empty if it was.
+    """
     if result.failures:
         return result
     with TemporaryDirectory() as folder:
         coils = read_setup(str(write_setup(Path(folder), result, setup, ""))).coils
-        apart, problem = bench.follow_square(coils)
+        apart, problem = follow_square(coils)
     if not problem and apart > SQUARE_ERROR:
         problem = f"the needle is {1e3 * apart:.2f} mm off ({1e3 * SQUARE_ERROR:g} mm allowed)"
     return replace(result, square=apart, failures=(f"square: {problem}",) if problem else ())

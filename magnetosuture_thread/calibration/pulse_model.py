@@ -232,6 +232,11 @@ class PulseModel:
         self._starts: list[Vector] = []
 
     @property
+    def intervals(self) -> dict[str, float]:
+        """Half of the 95 % interval of each parameter by its name, after a fit; see `KINDS` for the units."""
+        return dict(zip(self.names, (1.96 * self.deviations).tolist(), strict=True))
+
+    @property
     def parameters(self) -> RigParameters:
         """The parameters of the last fit."""
         return self._at(self._p)

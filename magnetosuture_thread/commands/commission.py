@@ -77,7 +77,7 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
         first = {"check_stops": partial(files.checked_stops, driven_bench, stops, terminal.log)} if options.live else {}
         radius = setup.scene.dish.radius
         result = Commissioning(bench, setup.coils, radius, terminal.log, options.seed, check=check, **first).run()
-        result = files.verify_square(result, setup, bench)
+        result = files.verify_square(result, setup, driven_bench.follow_square)
     if bench.reused:
         terminal.log(f"{bench.reused} pulses were there from a run before")
     how["rig_time"] = sum(float(pulse.times[-1] - pulse.on) for pulse in result.pulses)
