@@ -168,11 +168,8 @@ class ThreadModelSettings(
 
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
-        length, segments, diameter = (
-            self.thread_length,
-            self.segments,
-            self.diameter or MATERIALS[self.material].diameter,
-        )
+        length, segments = self.thread_length, self.segments
+        diameter = self.diameter or MATERIALS[self.material].diameter
         most_segments, sharpest = math.ceil(length / diameter) - 1, MAX_REST_ANGLE * segments / length
         softest = f"at least {MIN_ELASTIC_MODULUS:g} Pa, or 0 for the material's; the softest materials have 1 MPa"
         pairs = {"attachment_offset": "along and to the left", "gravity": "x and y", "flow": "x and y"}

@@ -270,11 +270,8 @@ class ThreadSession:
             predictor.follow_on(self._predictor)
             if estimator is not None and self._estimator is not None:
                 estimator.follow_on(self._estimator)
-            before = self._motion, self._estimate_motion, self._motion_before
-            after = [NodeMotion(settings.friction_averaging) for _ in before]
-            for motion, other in zip(after, before, strict=True):
-                motion.follow_on(other)
-            self._motion, self._estimate_motion, self._motion_before = after
+            for motion in (self._motion, self._estimate_motion, self._motion_before):
+                motion.averaging = settings.friction_averaging
             self.settings, self.scene, self._predictor, self._estimator = settings, scene, predictor, estimator
             self._measured = self._measured and estimator is not None
 

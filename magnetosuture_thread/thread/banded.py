@@ -422,13 +422,8 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
 @compiled_uncounted
 def solve(program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> tuple[int, int]:
     """Improve u and the multipliers in place; return status and iterations."""
-    axes, tolerance, band, vectors, active = (
-        buffers.axes,
-        buffers.tolerance,
-        buffers.band,
-        buffers.vectors,
-        buffers.active,
-    )
+    axes, tolerance, band = buffers.axes, buffers.tolerance, buffers.band
+    vectors, active = buffers.vectors, buffers.active
     d, width, rows, unknowns = len(axes), SPAN * len(axes), len(program.lower), program.linear.size
     step, force, smooth = vectors[0, : len(band)], vectors[1, :unknowns], vectors[2, :unknowns]
     weights, centre, image, before = vectors[3], vectors[4], vectors[5], vectors[6]

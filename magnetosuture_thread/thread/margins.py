@@ -262,10 +262,13 @@ class NodeMotion:
 
     Args:
         averaging: T, 0 for none [s].
+
+    Attributes:
+        averaging: T.
     """
 
     def __init__(self, averaging: float) -> None:
-        self._averaging = averaging
+        self.averaging = averaging
         self._last: Points | None = None
         self._velocity: Points | None = None
 
@@ -287,11 +290,7 @@ class NodeMotion:
         if last is None or velocity is None or last.shape != vertices.shape or interval <= 0.0:
             velocity = np.zeros(vertices.shape)
         else:
-            share = 1.0 - math.exp(-interval / self._averaging) if self._averaging > 0.0 else 1.0
+            share = 1.0 - math.exp(-interval / self.averaging) if self.averaging > 0.0 else 1.0
             velocity = velocity + share * ((vertices - last) / interval - velocity)
         self._last, self._velocity = vertices, velocity
         return self.speeds
-
-    def follow_on(self, other: NodeMotion) -> None:
-        """Continue from the motion of the thread that this one replaces."""
-        self._last, self._velocity = other._last, other._velocity

@@ -18,7 +18,7 @@ from magnetosuture_thread.geometry.scene import Scene, find_collision
 from magnetosuture_thread.settings.configuration import Quantity, bounded, checked_arguments
 from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
 from magnetosuture_thread.thread.barriers import SelfContact
-from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene
 from magnetosuture_thread.thread.mechanics import ThreadForces
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
@@ -396,11 +396,11 @@ class ThreadPredictor:
         positions, links = state.positions, last.links if last else None
         warm_start = formulation.warm_start() if results and velocities is not None else None
         # At once, as barriers may move on before they are asked again.
-        added = self.added.margins_at(pose.stamp, positions, pose.heading) if self.added else ()
+        added = self.added.rows_at(pose.stamp, positions, pose.heading)
 
         def compute_margins() -> Margins:
             margins = formulation.margins(positions, pose.heading, links)
-            return Margins.of([*margins, *added], tolerance, self.scene_version)
+            return Margins.of([*margins, *map(BarrierMargins.from_rows, added)], tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
             forces = formulation.forces(last, pose.heading) if last else None

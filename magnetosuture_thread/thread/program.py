@@ -15,10 +15,9 @@ with d coordinates a node, all is one band of half-width 3 d.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import Contacts
@@ -202,18 +201,10 @@ class RodBuffers(NamedTuple):
         nodes, dimension = program.linear.shape
         places = (2, nodes, GRIPS)
         grips = GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1))
-        motion, of_drag = (
-            StepMotion(*np.zeros((6, nodes, dimension))),
-            ((nodes, dimension, dimension), (nodes, dimension)),
-        )
+        motion = StepMotion(*np.zeros((6, nodes, dimension)))
+        of_drag = (nodes, dimension, dimension), (nodes, dimension)
         of_end = (4, nodes, dimension), (dimension,), (6, nodes - 1), (3,)
         return cls(program, grips, motion, *map(np.zeros, (*of_drag, *of_end)))
-
-    @property
-    def memory(self) -> tuple[NDArray[Any], ...]:
-        """What the next step takes over from the last besides the state: tension, pushes and friction."""
-        program = self.program
-        return program.multipliers[: len(program.linear) - 1], program.push, self.grips.shape, self.grips.force
 
 
 def first_rows(buffers: StepBuffers, rows: int) -> ChainProgram:

@@ -60,13 +60,6 @@ from magnetosuture_thread.thread.contact_rows import (
 )
 from magnetosuture_thread.thread.margins import BarrierMargins, constant_column
 from magnetosuture_thread.thread.material import Attachment, Thread
-from magnetosuture_thread.thread.mechanics import (
-    RodProperties,
-    ThreadForces,
-    friction_of,
-    keep_internal_forces,
-    write_forces,
-)
 from magnetosuture_thread.thread.program import (
     CONTACT,
     END,
@@ -109,7 +102,7 @@ class StepModel(NamedTuple):
         structured: whether the structured solver is to solve; if not, every solve is left to the caller.
     """
 
-    rod: RodProperties
+    rod: mechanics.RodProperties
     workspace: WorkspaceData
     tolerance: float
     max_solves: int = MAX_SOLVES
@@ -320,13 +313,8 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, interval: f
     """
     nodes, dimension = about.shape
     # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
-    gradient, lower, upper, known, chords = (
-        buffers.gradient,
-        buffers.lower,
-        buffers.upper,
-        buffers.known,
-        buffers.chords,
-    )
+    gradient, lower, upper = buffers.gradient, buffers.lower, buffers.upper
+    known, chords = buffers.known, buffers.chords
     first, compliance, multipliers, strain = buffers.first, buffers.compliance, buffers.multipliers, 0.0
     for i in range(nodes - 1):
         begin, moved = min(i, nodes - 3), 0.0
@@ -348,7 +336,7 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, interval: f
 
 
 @compiled_inner
-def _write_objective(rod: RodProperties, buffers: RodBuffers, step_input: StepInput) -> None:
+def _write_objective(rod: mechanics.RodProperties, buffers: RodBuffers, step_input: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
         P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z (v + flow)
@@ -456,7 +444,7 @@ def _accept(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -
     keep_pushes(buffers, rows, segments)
     if knows_friction(friction):
         keep_grips(buffers.program, buffers.grips, rows, segments, friction)
-    keep_internal_forces(buffers, rows, interval)
+    mechanics.keep_internal_forces(buffers, rows, interval)
     for i in range(len(about)):
         for a in range(about.shape[1]):
             # Known nodes have moved, and have no velocity.
@@ -504,12 +492,12 @@ class RodFormulation(Formulation):
         bands = mechanics.bending_bands(thread.segments, clamped)
         gravity, flow = self._vector("gravity", medium.gravity), self._vector("flow", medium.flow)
         rest, bending = np.ascontiguousarray(thread.rest_angles), float(thread.bending_stiffness)
-        self.rod = RodProperties(clamped, *sizes, bending, *drag, *air, gravity, rest, weights, bands, flow)
+        self.rod = mechanics.RodProperties(clamped, *sizes, bending, *drag, *air, gravity, rest, weights, bands, flow)
         first = solver.first if type(solver) is FallbackSolver else solver
         structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
         self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._program.first))
-        self._solve_step, self._force_kernel = TypedKernel(solve_step), TypedKernel(write_forces)
+        self._solve_step, self._force_kernel = TypedKernel(solve_step), TypedKernel(mechanics.write_forces)
         self._link_kernel = TypedKernel(link_margins)
         last_nodes = np.arange(1, self._rows + 1, dtype=np.uint32)
         last_nodes.flags.writeable = False
@@ -530,7 +518,8 @@ class RodFormulation(Formulation):
         return np.asarray(at_nodes)
 
     def _memory(self) -> WarmStart:
-        return self.buffers.memory
+        program, grips = self._program, self.buffers.grips
+        return program.multipliers[: self._rows], program.push, grips.shape, grips.force
 
     def forget(self) -> None:
         """Forget the last solve; see `Formulation`."""
@@ -659,14 +648,14 @@ class RodFormulation(Formulation):
         other._solver_buffers = BandedSolver().buffers(self._rows + 1, self.dimension, len(self._program.first))
         return other
 
-    def forces(self, result: StepResult, heading: Points) -> ThreadForces:
+    def forces(self, result: StepResult, heading: Points) -> mechanics.ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
         assert result.loads is not None
         tension, force, (friction, use) = np.empty(self._rows), np.empty(self.dimension), np.zeros((2, self._rows + 1))
         moment, scale = self.write_forces(result.loads, result.state.interval, heading, tension, force)
         if result.grip is not None:
-            friction, use = friction_of(result.grip)
-        return ThreadForces(tension, scale * result.loads[0][CONTACT], force, moment, scale * friction, use)
+            friction, use = mechanics.friction_of(result.grip)
+        return mechanics.ThreadForces(tension, scale * result.loads[0][CONTACT], force, moment, scale * friction, use)
 
     def write_forces(
         self, loads: tuple[Table, Vector], interval: float, heading: Points, tension: Vector, force: Vector

@@ -186,10 +186,6 @@ class AddedBarriers:
         self.move_to(stamp, positions[0], heading)
         return [barrier.rows(positions) for barrier in self._barriers]
 
-    def margins_at(self, stamp: float, positions: Points, heading: Points) -> list[BarrierMargins]:
-        """Return the margins of each barrier; see `rows_at`."""
-        return [BarrierMargins.from_rows(rows) for rows in self.rows_at(stamp, positions, heading)]
-
     def move_to(self, stamp: float, tail: Points, heading: Points) -> None:
         """Set the stamp of the next evaluation [s], and the needle: where the thread is fixed [m], and its heading."""
         self._heading = heading
