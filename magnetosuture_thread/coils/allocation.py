@@ -587,6 +587,7 @@ class CertifiedAllocation:
         pull: NeedleTwist | None,
         balance: float = 0.0,
         deviation: PoseDeviation = EXACT,
+        max_speed: float = math.inf,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.
 
@@ -599,6 +600,7 @@ class CertifiedAllocation:
             pull: motion that something else gives the needle; None where that is not measured.
             balance: of the torque that something else gives it, see `CoilAllocation` [T].
             deviation: of its pose.
+            max_speed: a limit that holds now, besides that of all motions [m/s].
         """
         at = pose.tail, pose.heading
 
@@ -610,7 +612,7 @@ class CertifiedAllocation:
             allocation = self._coils.allocate(
                 against, *at, previous.currents, max_change, deviation, balance=balance, at_tip=pull is None
             )
-            speed, limit = self._coils.slack_speed(allocation, pose.heading), self._max_speed
+            speed, limit = self._coils.slack_speed(allocation, pose.heading), min(self._max_speed, max_speed)
             if pull is not None:
                 limit = min(limit, math.hypot(wanted.along, wanted.across) + self._max_pull_speed)
             if speed <= limit:

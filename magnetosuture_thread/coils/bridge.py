@@ -135,7 +135,9 @@ class CoilBridge:
         extrapolator: extrapolates the needle's pose.
         prediction_monitor: monitors the thread model's margins.
         stamp_ages: how old commands and poses are when they arrive.
-        first_way: how far the needle still has to follow, before it is driven faster than `FIRST_SPEED` [m].
+        slow_way: how far a needle has to follow with this setup, and after each fault that it does not, before it is
+            driven faster than `FIRST_SPEED`; 0 where nothing moves [m].
+        first_way: how much of that is left [m].
         scene_problem: why the scene that was heard last is not in force, while the currents are zero; empty if it is.
 
     Raises:
@@ -170,7 +172,7 @@ class CoilBridge:
         self._stopped: float | None = None
         self._pose_stamp = -math.inf
         self._turned = 0.0  # by which the needle was turned since the last pose [rad]
-        self.first_way = 0.0
+        self.slow_way = self.first_way = 0.0
         self.set_scene(scene)
 
     @property
@@ -239,7 +241,7 @@ class CoilBridge:
             self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance, self.latch.armed, error)
         except InvalidInputError:
             if self.latch.armed and self.extrapolator.rejections >= CONSISTENT_POSES:
-                self.latch.trip(f"needle does not follow: {self.extrapolator.rejection}")
+                self._trip_follow(f"needle does not follow: {self.extrapolator.rejection}")
             raise
         deviation = 0.0
         if stamp > self._pose_stamp:
@@ -253,10 +255,16 @@ class CoilBridge:
         if motion is not None and self.latch.armed and self._filter is not None:
             at_shape = self._filter.clearance(tail, heading) < self._filter.keep_out
             if problem := self._follow.update(motion, at_shape):
-                self.latch.trip(problem)
-            elif driven := math.hypot(*motion.driven):
-                followed = min(driven, max(0.0, float(motion.measured @ motion.driven) / driven))
-                self.first_way = max(0.0, self.first_way - followed)
+                self._trip_follow(problem)
+            elif self.first_way and (driven := math.hypot(*motion.driven)):
+                # With its sign, so that noise adds nothing.
+                followed = min(driven, max(-driven, float(motion.measured @ motion.driven) / driven))
+                self.first_way = min(self.slow_way, max(0.0, self.first_way - followed))
+
+    def _trip_follow(self, problem: str) -> None:
+        """Latch that the needle does not follow; the next one moves slowly at first."""
+        self.latch.trip(problem)
+        self.first_way = self.slow_way
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
         """Register the thread model's margins; see `PredictionMonitor.update`."""
@@ -332,9 +340,8 @@ class CoilBridge:
             selected = selected._replace(tip=self._needle.kinematics.tip_velocity(pose.heading, commanded))
         no_prediction = self.prediction_monitor.stale_reason(now, arrival)
         reasons = self._stop_reasons(arrival, then, driver, selected, no_prediction)
+        active: tuple[str, ...] = (NO_PREDICTION,) if no_prediction else ()
         slowly = FIRST_SPEED if self.first_way else math.inf
-        limits = NO_PREDICTION if no_prediction else "", FIRST_MOTION if math.hypot(*selected.tip) > slowly else ""
-        active = tuple(filter(None, limits))
         if reasons or pose is None or self._filter is None:
             self._follow.end_probe()
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
@@ -352,19 +359,20 @@ class CoilBridge:
         # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
         slowed = selected.source == OPERATOR or settings.friction_feedback == "all"
         slowdown = self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0
-        kinematics, counted = self._needle.kinematics, self._follow.counted_pull(self._observer.velocity)
-        pull = self._observer.pull(pose.heading, counted) if compensates else None
+        kinematics, pull = self._needle.kinematics, self._observer.pull(pose.heading) if compensates else None
         if in_needle_frame:
             self._filter.set_time(now, self.extrapolator.first_stamp)
+            first = min(1.0, slowly / max(math.hypot(commanded.along, commanded.across), 1e-300))
+            commanded = commanded._replace(along=first * commanded.along, across=first * commanded.across)
             # Of the end that is turned ahead, which is the swifter one.
             swiftest = math.hypot(commanded.along, abs(commanded.across) + kinematics.lever * abs(commanded.turn_rate))
-            driven = math.hypot(commanded.along, commanded.across)  # a turn is no way, and ends an instability soon
-            limited = min(slowdown, max_speed / max(swiftest, 1e-300), slowly / max(driven, 1e-300))
+            limited = min(slowdown, max_speed / max(swiftest, 1e-300))
             twist = commanded.scaled(limited)
             wanted = kinematics.tip_velocity(pose.heading, twist)
             if not compensates:  # what is driven across the needle counts as a part of its turn
                 twist = kinematics.twist(pose.heading, wanted)
-            active += tuple(filter(None, (FRICTION if slowdown < 1.0 else "", SPEED if limited < slowdown else "")))
+            is_fast = limited < slowdown or first < 1.0
+            active += tuple(filter(None, (FRICTION if slowdown < 1.0 else "", SPEED if is_fast else "")))
         else:
             filtered = self._filter.filter(
                 selected.command,
@@ -382,7 +390,7 @@ class CoilBridge:
                 return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered.slowdown)
             wanted, aside = filtered.filtered, 0.0
             if compensates:
-                room = min(slowdown * math.hypot(*selected.command), max_speed - math.hypot(*wanted))
+                room = min(slowdown * math.hypot(*selected.command), min(max_speed, slowly) - math.hypot(*wanted))
                 room = max(0.0, room)  # while the needle slows down to another limit it is still faster
                 aside = min(room, max(-room, self._filter.sidestep(pose.tail, pose.heading)))
             twist = kinematics.twist(pose.heading, wanted)._replace(across=aside)
@@ -390,15 +398,21 @@ class CoilBridge:
             return self._zero_output(now, arrival, selected, (rest_reason(list(active) or [STILL]),), active, slowdown)
         if compensates:
             rate = max(0.0, MAX_BLIND_TURN - abs(self._turned)) / period
-            twist = twist._replace(turn_rate=min(rate, max(-rate, twist.turn_rate)))
+            unproven = self._observer.pull(pose.heading, self._follow.unproven_pull(self._observer.velocity))
+            twist = NeedleTwist(
+                twist.along + unproven.along,
+                twist.across + unproven.across,
+                min(rate, max(-rate, twist.turn_rate)),
+            )
         max_change = settings.max_current_slew * elapsed
         balance = 0.0 if pull is None else self._heading.balance(pull.across)
         doubt = PoseDeviation(self._observer.place_deviation(now), self._heading.stamp_deviation)
         allocation, limiting = self._coils.allocate(
-            twist, pose, self._filter, self._previous, max_change, pull, balance, doubt
+            twist, pose, self._filter, self._previous, max_change, pull, balance, doubt, slowly
         )
         limits = limiting, CURRENT_LIMIT if allocation.saturated else ""
         active += tuple(name for name in limits if name and name not in active)
+        active += (FIRST_MOTION,) if self.first_way and SPEED in active else ()
         pulled = NeedleTwist() if pull is None else pull
         expected = allocation.velocity + kinematics.tip_velocity(pose.heading, pulled)
         own_drift = allocation.drift if compensates else 0.0  # else it counts as part of the turn
@@ -418,11 +432,11 @@ class CoilBridge:
         n = np.array([-e[1], e[0]])
         applied = (motion.along - pulled.along) * e + own_drift * n
         # Where the force that is allowed does not suffice, what was intended is the wanted velocity.
-        intended = twist.along * e + twist.across * n if limiting == SPEED else applied + counted
+        intended = twist.along * e + twist.across * n if limiting == SPEED else applied + self._observer.velocity
         self._observer.apply(now, applied, intended, motion.turn_rate)
         self._follow.register_turn(motion.turn_rate * period)
         self._turned += motion.turn_rate * period
-        return self._output(selected, (), active, slowdown, counted if compensates else NO_VELOCITY)
+        return self._output(selected, (), active, slowdown, self._observer.velocity if compensates else NO_VELOCITY)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""

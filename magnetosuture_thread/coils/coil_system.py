@@ -161,8 +161,9 @@ class CoilSystem:
         if settings.autostart == "armed" and not moves_nothing:
             raise settings.refused("autostart", "active at most: what may move something is armed by a person")
         self._max_timeout = math.inf if moves_nothing else settings.driver_timeout
-        self._identity = settings.identity
-        bridge.first_way = 0.0 if moves_nothing or self._identity == self._followed else FIRST_WAY
+        self._identity = "" if moves_nothing else settings.identity
+        bridge.slow_way = FIRST_WAY if self._identity else 0.0
+        bridge.first_way = 0.0 if self._identity == self._followed else bridge.slow_way
         self.driver, self.driver_name = driver, settings.driver
         driver.open()
         self.bridge, self.timing = bridge, LoopTiming(1.0 / settings.rate)
@@ -250,6 +251,6 @@ class CoilSystem:
         self.bridge.scene_problem = scene_problem
         self.output = self.bridge.step(now, arrival, state)
         self.driver.apply(self.output.allocation.currents, arrival)
-        if self.bridge.first_way <= 0.0:
-            self._followed = self._identity  # recorded with the next switch: the loop does not wait for the disk
+        if self._identity:  # recorded with the next switch: the loop does not wait for the disk
+            self._followed = "" if self.bridge.first_way else self._identity
         return self.output

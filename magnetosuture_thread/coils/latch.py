@@ -149,8 +149,9 @@ class StopRecord:
             state, *rest = read_regular(self.path, 1000).decode().split() or [""]
             if rest and (len(rest) > 1 or not rest[0].isalnum()):
                 return RecordedState.STOPPED
+            found = RecordedState(state)
             self.followed = "".join(rest)
-            return RecordedState(state)
+            return found
         except FileNotFoundError:
             return RecordedState.SAFE
         except (OSError, ValueError):

@@ -327,13 +327,16 @@ class FollowMonitor:
         """Register by which angle the field was set to turn the needle [rad]."""
         self._turned += angle
 
-    def counted_pull(self, pull: Vector) -> Vector:
-        """Return what is compensated of a pull, shape (2,) [m/s].
+    def unproven_pull(self, pull: Vector) -> Vector:
+        """Return with what part of a pull the needle is let go, shape (2,) [m/s].
 
-        A needle that is held against a pull that grows may stand so still that its place proves nothing. After half of
-        `MAX_UNSEEN` only the pull that was known when it last moved counts: it moves, and is seen to, or it rests.
+        A needle that is held against a pull that grows may stand so still that its place proves nothing. From half of
+        `MAX_UNSEEN` on, and wholly from three quarters, it is to move with what that pull is more than when the needle
+        last moved: then it is seen to.
         """
-        return self._proven if math.hypot(*self._unseen) > 0.5 * MAX_UNSEEN else pull
+        share = min(1.0, max(0.0, 4.0 * math.hypot(*self._unseen) / MAX_UNSEEN - 2.0))
+        known = self._proven if float(self._proven @ pull) > 0.0 else NO_MOTION
+        return np.asarray(share * (pull - known))
 
     def is_trusted(self, stamp: float) -> bool:
         """Return whether a probe has lately shown that the poses are the needle's."""
@@ -407,7 +410,7 @@ class FollowMonitor:
         self._proven = min(self._proven, step.pull, key=lambda pull: math.hypot(*pull))
         self._still_turn, unseen = self._still_turn + step.measured_turn, self._unseen_turn + step.expected_turn
         # A torque that lasts keeps the needle off its field by as much, whatever the model says of its turning.
-        held = step.interval * TORQUE_ANGLE / TORQUE_TIME
+        held = step.interval * TORQUE_ANGLE / TORQUE_TIME if step.expected_turn else 0.0
         self._unseen_turn = math.copysign(max(0.0, abs(unseen) - held), unseen)
         if abs(self._still_turn) > VISIBLE_TURN:
             self._still_turn = self._unseen_turn = 0.0

@@ -234,9 +234,10 @@ class CoilBridgeSettings(
 
     @property
     def identity(self) -> str:
-        """Digits that differ between setups whose coils, needle, delay or boards differ."""
-        boards = self.driver, self.roboclaw_ports, self.roboclaw_addresses
-        what = repr((self.coils_properties(), self.needle(), self.motion_delay, boards))
+        """Digits that differ between setups by which a needle moves otherwise: coils, needle, delay, boards."""
+        boards = self.driver, self.roboclaw_ports, self.roboclaw_addresses, self.resistances()
+        law = self.aligning_field, self.motion_compensation, self.motion_delay
+        what = repr((self.coils_properties(), self.needle(), law, boards))
         return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def resistances(self) -> tuple[float, ...]:

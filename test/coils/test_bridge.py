@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.bridge import FIRST_MOTION, FIRST_SPEED, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.coils.motion_observer import FollowMonitor
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
@@ -604,28 +605,69 @@ def test_after_a_stop_the_needle_starts_from_rest():
 def test_a_needle_that_moves_for_the_first_time_is_driven_slowly_until_it_has_followed(
     compensates: bool, twist: tuple[float, ...]
 ):
-    """Poses that move, and not as commanded, do not count."""
     plant = Plant(CoilBridgeSettings(motion_compensation=compensates), Scene(Dish(0.08)), velocity=twist).ready()
-    plant.bridge.first_way = 2e-3
+    plant.bridge.slow_way = plant.bridge.first_way = 2e-3
     places = [tail for tail, _ in driven(plant, 400, tail=TAIL - np.array([0.01, 0.0]), latency=2, interval=4)]
     steps = np.hypot(*np.diff(places, axis=0).T)
     travel = np.cumsum(steps)
-    outputs = [output for _, output in plant.outputs][1:]
-    slow = [FIRST_MOTION in output.active for output in outputs[10:]]
-    since = 10 + slow.index(False)
-    assert all(slow[: since - 10])
-    assert not any(slow[since - 10 :])
+    slow = [FIRST_MOTION in output.active for _, output in plant.outputs[1:]]
+    begin, since = slow.index(True), len(slow) - slow[::-1].index(True)
+    assert all(slow[begin:since])
+    assert begin < 10
     assert steps[:since].max() < 1.05 * FIRST_SPEED * PERIOD
     assert 1.9e-3 < travel[since] < 2.3e-3
     assert steps[since + 20 :].max() > 0.006 * PERIOD
 
 
+@pytest.mark.parametrize("factor", [2.0, 4.0])
+def test_in_its_first_motion_a_needle_that_is_too_swift_is_not_driven_faster_for_that(factor: float):
+    """Its excess is taken for a pull, and compensated by no more than that speed by the model."""
+    plant = Plant(CoilBridgeSettings(motion_compensation=True), Scene(Dish(0.08)), velocity=(0.008, 0.0, 0.0)).ready()
+    plant.bridge.slow_way = plant.bridge.first_way = 0.01
+    error, speeds = np.zeros(2), []
+    for tail, heading in driven(plant, 400, error=error, latency=10, interval=10):
+        way = tail - TAIL + 0.0035 * (heading - EAST)
+        error[:] = (1.0 - factor) * way
+        applied = plant.outputs[-1][1].allocation
+        speeds.append(math.hypot(*applied.velocity))
+        if plant.bridge.latch.fault or not plant.bridge.first_way:
+            break
+    assert max(speeds) < 1.05 * FIRST_SPEED
+
+
+def test_a_fault_of_following_is_followed_by_a_slow_motion():
+    plant = Plant(velocity=(0.008, 0.0)).ready()
+    plant.bridge.slow_way, error = 0.01, np.zeros(2)
+    for tail, heading in driven(plant, 400, error=error, latency=2, interval=4):
+        error[:] = 2.0 * (tail - TAIL + 0.0035 * (heading - EAST))  # poses move back
+        if plant.bridge.latch.fault:
+            break
+    assert plant.bridge.latch.fault.startswith("needle does not follow")
+    assert plant.bridge.first_way == 0.01
+
+
 @pytest.mark.parametrize("shown", [(0.0, 0.0), (0.0, -1.0), (-0.5, 0.0)])
 def test_poses_that_do_not_follow_end_no_first_motion(shown: tuple[float, float]):
-    """They stand still, move to a side, or back."""
-    plant = Plant(velocity=(0.008, 0.0)).ready()
-    plant.bridge.first_way, error = 2e-3, np.zeros(2)
+    """They stand still, move to a side, or back, and tremble."""
+    plant, random = Plant(velocity=(0.008, 0.0)).ready(), np.random.default_rng(1)
+    plant.bridge.slow_way = plant.bridge.first_way = 2e-3
+    error = np.zeros(2)
     for tail, heading in driven(plant, 400, error=error, latency=2, interval=4):
         way = tail - TAIL + 0.0035 * (heading - EAST)  # of the middle
-        error[:] = way - math.hypot(*way) * np.array(shown)
+        error[:] = way - math.hypot(*way) * np.array(shown) + 2e-5 * random.standard_normal(2)
+    assert math.hypot(*way) > 5e-4
     assert plant.bridge.first_way > 1.8e-3
+
+
+@pytest.mark.parametrize("let_go", [0.0, 1.0])
+def test_a_needle_that_is_let_go_moves_with_its_pull_as_is_expected_of_it(
+    let_go: float, monkeypatch: pytest.MonkeyPatch
+):
+    """See `FollowMonitor.unproven_pull`."""
+    monkeypatch.setattr(FollowMonitor, "unproven_pull", lambda self, pull: let_go * pull)
+    plant = Plant(CoilBridgeSettings(motion_compensation=True), Scene(Dish(0.08)), velocity=(0.0, 0.0, 0.1)).ready()
+    pull = np.array([1.6e-3, 1.2e-3])
+    places = [tail + 0.0035 * heading for tail, heading in driven(plant, 600, pull=pull, latency=2, interval=4)]
+    assert not plant.bridge.latch.fault
+    speed = np.diff(places[-200:], axis=0).mean(axis=0) / PERIOD
+    assert speed == pytest.approx(let_go * pull, abs=1e-4)

@@ -105,13 +105,30 @@ def test_a_setup_that_a_needle_has_not_followed_with_moves_it_slowly_at_first(tm
     assert opened(path, known)[1].first_way == 0.0
     assert opened(path, changed)[1].first_way == FIRST_WAY
     assert opened(path, changed, RecordingDriver)[1].first_way == 0.0
-    path.unlink()
+    simulated, _ = opened(path, changed, RecordingDriver)
+    simulated.step(500.0, 100.0)
+    simulated.remember(ends=True)
+    system, bridge = opened(path, known)
+    assert bridge.first_way == 0.0  # what moves nothing proves nothing, and forgets nothing
+    bridge.first_way = bridge.slow_way  # as after a fault
+    system.step(500.0, 100.0)
+    system.remember(ends=True)
+    assert opened(path, known)[1].first_way == FIRST_WAY
+    path.write_text("disarmed\n")
     assert opened(path, known)[1].first_way == FIRST_WAY
 
 
 @pytest.mark.parametrize(
     "change",
-    [{"coil_angles": (0.1, 1.6, 3.1, 4.7)}, {"needle_moment": 1e-3}, {"motion_delay": 0.03}, {"needle_drag": 0.03}],
+    [
+        {"coil_angles": (0.1, 1.6, 3.1, 4.7)},
+        {"needle_moment": 1e-3},
+        {"motion_delay": 0.03},
+        {"needle_drag": 0.03},
+        {"coil_resistance": 9.0},
+        {"aligning_field": 0.01},
+        {"motion_compensation": True},
+    ],
 )
 def test_what_moves_the_needle_otherwise_is_another_setup(change):
     assert CoilBridgeSettings(**change).identity != CoilBridgeSettings().identity
