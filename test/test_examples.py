@@ -30,3 +30,8 @@ def test_an_example_runs(name: str):
     path = FOLDER / f"{name}.py"
     assert len(path.read_text().splitlines()) <= LINES
     assert re.search(SAYS[name], run_python(path.name, cwd=FOLDER))
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.py") if path.stem not in SAYS))
+def test_a_script_that_makes_what_is_shipped_can_be_run(name: str):
+    run_python("-c", f"import runpy; runpy.run_path({str(FOLDER / name)!r} + '.py')", cwd=FOLDER.parent)

@@ -184,7 +184,9 @@ class Value:
             return math.nan
         if self.unit == "rad":
             return math.remainder(self.value - self.before, math.tau)
-        return self.value / self.before - 1.0 if self.before else math.inf
+        if not self.before:
+            return math.copysign(math.inf, self.value) if self.value else 0.0
+        return self.value / self.before - 1.0
 
     @property
     def changed(self) -> bool:

@@ -42,6 +42,7 @@ from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 
 RATE = 33.0  # Hz, of the paper's simulation
 COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge
+PAPER_SEGMENTS = 40  # of the thread in the paper's figure
 NODE_COLOURS = ("#0b3c5d", "#1f77b4", "#2a9d8f", "#8ab17d", "#e9a03b")  # of the first nodes, whose barriers are drawn
 _AHEAD = np.array([1.0, 0.0])  # a point has no heading, and a thread that turns freely asks for none
 
@@ -61,8 +62,8 @@ class SteeredInstant:
     time: float
     prediction: Prediction
     margins: Margins
-    command: FilteredCommand | None = None
-    took: float = 0.0
+    command: FilteredCommand | None
+    took: float
 
     def figures(self) -> dict[str, Any]:
         """Return the figures, as JSON has them."""
@@ -76,6 +77,66 @@ class SteeredInstant:
             "passed": command.filtered.tolist() if command else [0.0, 0.0],
             "needle": self.prediction.positions[0].tolist(),
         }
+
+
+class SteeredThread:
+    """The loop of an operator, the needle's filter and the thread, without a rig.
+
+        u_0 = filter(beta^count v_0),    x_0 <- x_0 + dt u_0,    then the thread's step
+
+    Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback". Deviation: the friction by which
+    v_0 is slowed is that of the thread where it is now, as in the source; the thread's step sees the needle where it
+    has moved to.
+
+    Args:
+        settings: of the thread among its obstacles.
+        centreline: where the thread lies at the start, from the needle on, shape (m, 2) [m].
+        needle: the filter of a needle that is a point.
+
+    Raises:
+        ConfigurationError: an obstacle cannot be used.
+        InvalidInputError: the thread cannot begin there.
+    """
+
+    def __init__(self, settings: ThreadModelSettings, centreline: Points, needle: NeedleSafetyFilter) -> None:
+        self._session = ThreadSession(replace(settings, initial_shape="measured", estimator=False), needle.scene)
+        self._needle = needle
+        self._stamp = 0
+        self._tail = np.asarray(centreline[0], dtype=np.float64)
+        for _ in self._session.on_measured_thread(0, centreline):
+            pass
+        self.now = self._advance(None, 0.0)
+
+    def step(self, interval: float, commanded: NDArray[np.float64]) -> SteeredInstant:
+        """Move the needle as it is commanded, as far as it may, and let the thread follow.
+
+        Args:
+            interval: dt [s].
+            commanded: v_0, shape (2,) [m/s].
+
+        Raises:
+            InvalidInputError: the velocity is not finite, or beyond 1 m/s.
+            SolverError: a program had no solution, or its linearisation did not converge.
+        """
+        began, slowdown = perf_counter(), self.now.margins.friction.slowdown
+        if not math.hypot(*commanded.tolist()) <= 1.0:  # what commands more was meant in another unit
+            raise InvalidInputError("needle velocity", commanded.tolist(), "finite numbers, at most 1 m/s")
+        command = self._needle.filter(commanded, self._tail, _AHEAD, slowdown=slowdown)
+        self._tail = self._tail + interval * command.filtered
+        self._stamp += round(interval * 1e9)
+        self.now = self._advance(command, began)
+        return self.now
+
+    def _advance(self, command: FilteredCommand | None, began: float) -> SteeredInstant:
+        outcome = self._session.on_pose(self._stamp, NeedlePose(self._stamp * 1e-9, self._tail, _AHEAD))
+        if outcome.problem is not None:
+            raise outcome.problem
+        prediction = outcome.prediction
+        assert prediction is not None
+        if outcome.margins is None:
+            raise SolverError(prediction.solver, prediction.status, prediction.residual, 0.0)
+        took = perf_counter() - began if command is not None else 0.0
+        return SteeredInstant(self._stamp * 1e-9, prediction, outcome.margins, command, took)
 
 
 class RecordedCommands(NamedTuple):
@@ -171,13 +232,7 @@ def replay_steering(
     needle: NeedleSafetyFilter,
     progress: Progress = lambda share: None,
 ) -> HerniaRun:
-    """Steer a thread as recorded: the loop of an operator, the needle's filter and the thread, without a rig.
-
-        u_0 = filter(beta^count v_0),    x_0 <- x_0 + dt u_0,    then the thread's step
-
-    Source: [Forghani2025], algorithm "Real-Time Thread Sim with Visual Feedback". Deviation: the friction by which
-    v_0 is slowed is that of the thread where it is now, as in the source; the thread's step sees the needle where it
-    has moved to.
+    """Steer a thread as recorded.
 
     Args:
         settings: of thread and obstacles.
@@ -188,23 +243,14 @@ def replay_steering(
 
     Raises:
         ConfigurationError: an obstacle cannot be used.
-        InvalidInputError: the thread cannot begin there, or a velocity is not finite, or beyond 1 m/s.
-        SolverError: a program had no solution, or its linearisation did not converge.
+        InvalidInputError: the thread cannot begin there, or a velocity cannot be used.
+        SolverError: a step had no solution.
     """
-    session = ThreadSession(replace(settings, initial_shape="measured", estimator=False), needle.scene)
-    for _ in session.on_measured_thread(0, centreline):
-        pass
-    tail, interval = np.asarray(centreline[0], dtype=np.float64), 1.0 / RATE
-    instants = [_predict(session, 0, tail)]
+    thread = SteeredThread(settings, centreline, needle)
+    instants = [thread.now]
     count = math.ceil((commands.times[-1] + COMMAND_TIMEOUT) * RATE) if len(commands.times) else 0
     for k in range(count):
-        commanded, began = commands.at(k / RATE), perf_counter()
-        if not math.hypot(*commanded.tolist()) <= 1.0:  # what commands more was meant in another unit
-            raise InvalidInputError("needle velocity", commanded.tolist(), "finite numbers, at most 1 m/s")
-        command = needle.filter(commanded, tail, _AHEAD, slowdown=instants[-1].margins.friction.slowdown)
-        tail = tail + interval * command.filtered
-        instant = _predict(session, (k + 1) * round(interval * 1e9), tail)
-        instants.append(replace(instant, command=command, took=perf_counter() - began))
+        instants.append(thread.step(1.0 / RATE, commands.at(k / RATE)))
         progress((k + 1) / count)
     farthest = 1.0  # m; farther than any obstacle of a dish
     around = Workspace(needle.scene.obstacles, farthest)
@@ -219,18 +265,6 @@ def replay_steering(
     nearest = min(distances(0.5 * (points[1:] + points[:-1])).min(initial=farthest) for points in positions)
     radius = 0.5 * settings.thread().diameter
     return HerniaRun(settings, needle.scene, instants, barriers - radius, max(0.0, -float(nearest)))
-
-
-def _predict(session: ThreadSession, stamp: int, tail: NDArray[np.float64]) -> SteeredInstant:
-    """Return the thread whose needle is at a place [m] at a time [ns]."""
-    outcome = session.on_pose(stamp, NeedlePose(stamp * 1e-9, tail, _AHEAD))
-    if outcome.problem is not None:
-        raise outcome.problem
-    prediction = outcome.prediction
-    assert prediction is not None
-    if outcome.margins is None:
-        raise SolverError(prediction.solver, prediction.status, prediction.residual, 0.0)
-    return SteeredInstant(stamp * 1e-9, prediction, outcome.margins)
 
 
 def replay_hernia(
@@ -297,7 +331,7 @@ def read_steering(bag: Bag) -> RecordedCommands:
 
 def paper_model(setup: Setup) -> ThreadModelSettings:
     """Return the thread model of a setup with the number of segments of the paper's figure."""
-    return replace(setup.model, segments=40)
+    return replace(setup.model, segments=PAPER_SEGMENTS)
 
 
 def start_centreline(setup: Setup) -> np.ndarray:

@@ -396,11 +396,11 @@ class ThreadPredictor:
         positions, links = state.positions, last.links if last else None
         warm_start = formulation.warm_start() if results and velocities is not None else None
         # At once, as barriers may move on before they are asked again.
-        added = self.added.rows_at(pose.stamp, positions, pose.heading)
+        added = [BarrierMargins.from_rows(rows) for rows in self.added.rows_at(pose.stamp, positions, pose.heading)]
 
         def compute_margins() -> Margins:
             margins = formulation.margins(positions, pose.heading, links)
-            return Margins.of([*margins, *map(BarrierMargins.from_rows, added)], tolerance, self.scene_version)
+            return Margins.of([*margins, *added], tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
             forces = formulation.forces(last, pose.heading) if last else None
