@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Protocol
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -24,9 +24,6 @@ from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.files import MAX_FILE_BYTES
 from magnetosuture_thread.settings.interface import Channel, Quality
-
-if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.node import GuardedNode
 
 QUALITIES = {
     Quality.SENSOR: qos_profile_sensor_data,
@@ -46,6 +43,14 @@ MAX_BYTES = {
     "visualization_msgs": 1 << 22,
 }
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
+
+
+class Subscriber(Protocol):
+    """A node that reports messages that are refused, by the errors of their callbacks."""
+
+    input_errors: ClassVar[tuple[type[Exception], ...]]
+    create_subscription: Callable[..., Subscription]
+    refuse: Callable[[Exception], None]
 
 
 @dataclass(frozen=True)
@@ -94,7 +99,7 @@ class Topic:
             expected = f"a {self.channel.type_name} of our definition"
             raise InvalidInputError(self.channel.name, f"{len(data)} bytes", expected) from None
 
-    def subscribe(self, node: GuardedNode, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
+    def subscribe(self, node: Subscriber, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         What comes is bytes: what is too large is not made into a message first.
@@ -111,7 +116,7 @@ class Topic:
         )
 
     def subscribe_numbered(
-        self, node: GuardedNode, callback: Callable[[Any, int], None], then: Callable[[], None] = lambda: None
+        self, node: Subscriber, callback: Callable[[Any, int], None], then: Callable[[], None] = lambda: None
     ) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
 
@@ -138,7 +143,7 @@ class Topic:
         subscription = self.subscribe(node, take, raw=True)
         return subscription
 
-    def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> bool:
+    def decoded(self, node: Subscriber, data: bytes, callback: Callable[[Any], None]) -> bool:
         """Call back with the message of some bytes; return whether the callback did not refuse it, else report that."""
         try:
             callback(self.decode(data))
