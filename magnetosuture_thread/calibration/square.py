@@ -49,7 +49,7 @@ class Square:
     def command(self, stamp: float, pose: Vector, age: float) -> Vector:
         """Return the velocity of the tip for a pose, tail and heading, of a time, and its age, shape (2,) [m/s]."""
         heading = np.array([math.cos(pose[2]), math.sin(pose[2])])
-        command = self._path.compute_command(stamp, pose[:2], heading, age + self.settings.motion_delay)
+        command = self._path.compute_command(stamp, pose[:2], heading, age)
         self._tips.append(pose[:2] + self._length * heading)
         self._setpoints.append(command.tip)
         self._progress = command.progress
