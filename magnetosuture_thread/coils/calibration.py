@@ -29,7 +29,7 @@ from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInpu
 from magnetosuture_thread.settings.files import MAX_TEXT_BYTES, read_regular
 
 MODEL = "loops"  # of the field of a coil
-MIN_COILS = 3  # needed to pull in every direction
+MIN_COILS, MAX_COILS = 3, 64  # three are needed to pull in every direction
 TEXT_KEYS = ("name", "date", "notes")
 PARAMETERS = ("angle", "distance", "radius", "field_per_current")  # of a coil
 
@@ -200,8 +200,8 @@ def _number(where: str, text: str, limits: Quantity) -> float:
 def _ordered_names(named: list[str], path: Path) -> tuple[str, ...]:
     """Return the coils' names in the order of their currents."""
     names = list(dict.fromkeys(named))
-    if len(names) > 64:
-        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", "at most 64")
+    if len(names) > MAX_COILS:
+        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", f"at most {MAX_COILS}")
     if not all(name.startswith("coil_") and _is_index(name.removeprefix("coil_")) for name in names):
         return tuple(names)
     wanted = [f"coil_{k}" for k in range(len(names))]

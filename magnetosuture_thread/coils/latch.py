@@ -149,9 +149,9 @@ class StopRecord:
             state, *rest = read_regular(self.path, 1000).decode().split() or [""]
             if rest and (len(rest) > 1 or not rest[0].isalnum()):
                 return RecordedState.STOPPED
-            found = RecordedState(state)
+            recorded = RecordedState(state)  # before the setup of a damaged file is believed
             self.followed = "".join(rest)
-            return found
+            return recorded
         except FileNotFoundError:
             return RecordedState.SAFE
         except (OSError, ValueError):

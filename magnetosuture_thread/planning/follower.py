@@ -182,7 +182,7 @@ class PathFollower:
             stamp: of the pose [s].
             tail: shape (2,) [m].
             heading: unit vector at the tail, shape (2,).
-            age: of the pose when the command acts [s].
+            age: of the pose when the command is sent [s].
 
         Raises:
             InvalidInputError: waypoints and first pose do not define a path.

@@ -59,6 +59,19 @@ def test_pictures_give_one_entry_each(tmp_path: Path):
     assert sorted(picture.name for picture in overlay.iterdir()) == ["frame_00.png", "frame_03.png", "frame_09.png"]
 
 
+def test_in_a_folder_of_pictures_that_do_not_follow_each_other_each_is_searched(tmp_path: Path):
+    """The needle jumps by more than it can go, and comes back."""
+    truth = json.loads((SAMPLES / "truth.json").read_text())["frames"]
+    (tmp_path / "frames").mkdir()
+    order = [0, 2, 0, 3, 1, 3, 0]
+    for number, index in enumerate(order):
+        shutil.copy(SAMPLES / f"frame_0{index}.png", tmp_path / "frames" / f"{number}.png")
+    assert cli.main(["track", str(tmp_path / "frames"), "--json", str(tmp_path / "found.json")]) == 0
+    rows = json.loads((tmp_path / "found.json").read_text())
+    tails = np.array([truth[index]["tail_mm"] for index in order])
+    np.testing.assert_allclose(1e3 * np.array([row["tail_m"] for row in rows]), tails, atol=0.05)
+
+
 def test_a_needle_without_a_thread_has_an_axis_and_a_pose_once_its_tip_is_given(tmp_path: Path):
     picture = tmp_path / "rod.png"
     cv2.imwrite(str(picture), rod(ENDS))
