@@ -304,7 +304,7 @@ class Commissioning:
         drag = along, along * needle.drag_across / needle.slack_drag, turning
         angles = np.array([answer.direction for answer in answers])
         strengths = signs * mean * np.exp(speeds - speeds.mean())
-        return RigParameters(angles, strengths, distance, radius, moment, self._length, drag, 0.03, np.zeros(2))
+        return RigParameters(angles, strengths, distance, radius, moment, self._length, drag, 0.03, *np.zeros((2, 2)))
 
     def _designed(self, model: PulseModel, top: float, tries: int) -> bool:
         """Give the most telling of some pulses that are slow, near and foreseeable; return whether there was one."""

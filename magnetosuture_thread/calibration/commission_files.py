@@ -18,7 +18,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import read_pose, stamp_of
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.calibration.commission import SQUARE_ERROR, Bench, Commissioned
-from magnetosuture_thread.calibration.pulse_model import DELAY_UNIT, RESIDUAL_UNIT, Pulse, RigParameters
+from magnetosuture_thread.calibration.pulse_model import DELAY_UNIT, LIGHT_UNIT, RESIDUAL_UNIT, Pulse, RigParameters
 from magnetosuture_thread.calibration.stop_checks import StopBench, check_stops
 from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.field import CoilProperties
@@ -225,6 +225,8 @@ def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]
     for axis, residual in zip("xy", rig.residual.tolist(), strict=True):
         interval = RESIDUAL_UNIT * wide[f"residual {axis}"]
         values.append(Value(f"residual field {axis}", "T", residual, interval, MEASURED, nothing))
+    for axis, light in zip("xy", rig.light.tolist(), strict=True):
+        values.append(Value(f"light {axis}", "m", light, LIGHT_UNIT * wide[f"light {axis}"], MEASURED, nothing))
     mean = math.exp(np.log(np.abs(rig.fields)).mean())
     values.append(Value("mean field_per_current", "T/A", mean, nothing, GAUGE, mean))
     values.append(Value("needle_moment", "A m^2", rig.moment, nothing, GAUGE, needle.moment))
@@ -309,6 +311,7 @@ def read_rig(folder: Path, believed: CoilBridgeSettings) -> RigParameters:
             drag=(along, across, turning),
             delay=values["motion_delay"],
             residual=np.array([values["residual field x"], values["residual field y"]]),
+            light=np.array([values.get("light x", 0.0), values.get("light y", 0.0)]),
         )
     except KeyError as error:
         raise ConfigurationError("values", f"no {error}", "those of this setup's coils", str(path)) from None

@@ -20,10 +20,10 @@ from magnetosuture_thread.geometry.polyline import Vector
 
 Residuals = Callable[[Vector], Vector]
 
-RESIDUAL_UNIT, DELAY_UNIT = 1e-4, 0.01  # T and s
+RESIDUAL_UNIT, DELAY_UNIT, LIGHT_UNIT = 1e-4, 0.01, 1e-5  # T, s and m
 OUTLIER = 3.0  # standard deviations, beyond which a residual counts less (Huber)
 # Kinds of parameters, the first two of each coil: standard deviation of what a ruler and a label say before, and the
-# 95 % interval that is narrow enough; of the logarithm, but of angles [rad], delay and residual field in their units.
+# 95 % interval that is narrow enough; of the logarithm, but of angles [rad], delay, residual field and light in units.
 KINDS = {
     "angle": (3.0, 0.01),
     "field": (1.5, 0.02),
@@ -36,8 +36,12 @@ KINDS = {
     "delay": (5.0, 0.4),
     "residual x": (3.0, 0.1),
     "residual y": (3.0, 0.1),
+    "light x": (3.0, math.inf),
+    "light y": (3.0, math.inf),
 }
-END_BIAS = 1.2e-5  # m; error of a needle's end that is the same in all frames, 0.15 px of 0.08 mm
+# Errors of a needle's end that are the same in all frames [m]: along the needle, 0.15 px of 0.08 mm, and across it
+# beside that of the light, 0.06 px.
+END_BIAS, AXIS_BIAS = 1.2e-5, 5e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +160,7 @@ class RigParameters:
         drag: along and across [N s/m], turning [N m s].
         delay: from a command to the motion that frames show, by their stamps [s].
         residual: field without currents, shape (2,) [T].
+        light: by how much the tip shows off more than the tail, away from a lamp that steel reflects, shape (2,) [m].
     """
 
     angles: Vector
@@ -167,11 +172,14 @@ class RigParameters:
     drag: tuple[float, float, float]
     delay: float
     residual: Vector
+    light: Vector
 
     def poses(self, pulse: Pulse, start: Vector) -> Vector:
-        """Return the predicted poses at the times of a pulse's frames, from the first one on, shape (k, 3)."""
+        """Return the poses that frames of a pulse are predicted to show, from the first one on, shape (k, 3)."""
         on, off = pulse.on + self.delay, pulse.off + self.delay
-        return pulse_motion(self._coils, self._needle, self.residual, pulse.currents, on, off, pulse.times, start)
+        poses = pulse_motion(self._coils, self._needle, self.residual, pulse.currents, on, off, pulse.times, start)
+        poses[:, 2] += (self.light[1] * np.cos(poses[:, 2]) - self.light[0] * np.sin(poses[:, 2])) / self.length
+        return poses
 
     @cached_property
     def _coils(self) -> Vector:
@@ -225,7 +233,7 @@ class PulseModel:
         of_each, shared = [*KINDS][:2], [*KINDS][2:]
         self.names = [f"{kind} {k}" for kind in of_each for k in range(count)] + shared
         logs = np.log([guess.distance, guess.radius, *guess.drag, guess.length])
-        others = guess.delay / DELAY_UNIT, *(guess.residual / RESIDUAL_UNIT)
+        others = guess.delay / DELAY_UNIT, *(guess.residual / RESIDUAL_UNIT), *(guess.light / LIGHT_UNIT)
         self._p = np.array([*guess.angles, *np.log(np.abs(guess.fields) / self._field), *logs, *others])
         self._prior, self._weak = self._p.copy(), np.array([KINDS[kind_of(name)][0] for name in self.names])
         self.information, self.chi_square = np.diag(self._weak**-2.0), 1.0
@@ -245,9 +253,9 @@ class PulseModel:
         count = len(self._signs)
         gains, (distance, radius, *drag, length) = p[count : 2 * count], np.exp(p[2 * count : 2 * count + 6]).tolist()
         fields = self._signs * self._field * np.exp(gains - gains.mean())
-        delay, residual = max(0.0, float(p[-3])) * DELAY_UNIT, p[-2:] * RESIDUAL_UNIT
+        delay, fixed = max(0.0, float(p[-5])) * DELAY_UNIT, (p[-4:-2] * RESIDUAL_UNIT, p[-2:] * LIGHT_UNIT)
         drags = (drag[0], drag[1], drag[2])
-        return RigParameters(p[:count], fields, distance, radius, self._guess.moment, length, drags, delay, residual)
+        return RigParameters(p[:count], fields, distance, radius, self._guess.moment, length, drags, delay, *fixed)
 
     def by_parameters(self, pulse: Pulse, start: Vector) -> Vector:
         """Return how the predicted poses change by the parameters, in deviations, shape (3 k, n)."""
@@ -323,11 +331,12 @@ class PulseModel:
     def _bias(self) -> Vector:
         """Return deviations of the parameters by errors that no number of frames averages out.
 
-        An end that shows e = `END_BIAS` off turns the axis of a needle of length l by e / l, and makes lengths wrong by
-        that share: of the needle by both ends, of a way by half, as both its ends show off alike.
+        A needle of length l whose end shows off by `END_BIAS` along it seems longer by that share, by both ends, and a
+        way by half of it, as both ends show off alike. By `AXIS_BIAS` across it, its axis seems turned by that over l.
         """
-        share, size, count = END_BIAS / self.parameters.length, float(np.hypot(*self._p[-2:])), len(self._signs)
+        share, turn, count = END_BIAS / self.parameters.length, AXIS_BIAS / self.parameters.length, len(self._signs)
+        size = float(np.hypot(*self._p[-4:-2]))
         # Of a drag there is 0.004 besides, of coils that are one loop here, and of the camera's scale.
         drag, both = math.hypot(0.004, share), math.sqrt(2.0) * share
-        others = (drag, drag, drag, both, 0.0, both * size, both * size)
-        return np.array([*[share] * count, *[0.5 * share] * count, 0.0, 0.0, *others])
+        others = (drag, drag, drag, both, 0.0, turn * size, turn * size, 0.0, 0.0)
+        return np.array([*[turn] * count, *[0.5 * share] * count, 0.0, 0.0, *others])

@@ -27,8 +27,8 @@ def parameters(**changes: object) -> RigParameters:
     distance, radius = 0.05, 0.025
     field = 480.0 * 4e-7 * math.pi * radius**2 / (2.0 * (radius**2 + distance**2) ** 1.5)
     gains, moment = np.array([1.0, -0.7, 1.3, 0.8]), NEEDLE.pole * LENGTH
-    residual = np.array([4e-5, -6e-5])
-    rig = RigParameters(ANGLES, gains * field, distance, radius, moment, LENGTH, NEEDLE.drag, 0.03, residual)
+    residual, light = np.array([4e-5, -6e-5]), np.zeros(2)
+    rig = RigParameters(ANGLES, gains * field, distance, radius, moment, LENGTH, NEEDLE.drag, 0.03, residual, light)
     return replace(rig, **changes)  # type: ignore[arg-type]
 
 
@@ -133,7 +133,7 @@ def test_a_fit_ends_as_soon_as_something_interrupts_it():
 
 @pytest.mark.slow
 def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
-    truth, random = parameters(), np.random.default_rng(5)
+    truth, random = parameters(light=np.array([2e-5, -3e-5])), np.random.default_rng(5)
     pulses, pose = [], np.array([-0.003, 0.0, 0.4])
     for _ in range(40):
         given = pulse((random.standard_normal(4) * (random.random(4) < 0.7) * 0.5).tolist(), random.uniform(0.1, 0.5))
@@ -147,6 +147,7 @@ def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
         drag=drags,
         delay=0.0,
         residual=np.zeros(2),
+        light=np.zeros(2),
     )
     # The mean of the fields is held.
     guess = replace(guess, fields=guess.fields * np.exp(np.log(np.abs(truth.fields / guess.fields)).mean()))
@@ -163,8 +164,10 @@ def test_a_fit_to_noisy_poses_finds_the_rig_and_its_intervals_hold_it():
         math.log(found.length / truth.length),
         100.0 * (found.delay - truth.delay),
         *(1e4 * (found.residual - truth.residual)),
+        *(1e5 * (found.light - truth.light)),
     ]
     assert np.count_nonzero(np.abs(errors) < 1.96 * model.deviations) >= len(errors) - 2
     assert np.abs(errors[:4]).max() < 0.003
     assert np.abs(errors[4:8]).max() < 0.005
     assert np.abs(errors[10:13]).max() < 0.02
+    assert np.abs(errors[-2:]).max() < 0.6  # 10 um
