@@ -71,7 +71,7 @@ export class ProcedureBar {
     }
     find("hold-to-run").disabled = !may || active;
     find("hold-to-run").setAttribute("aria-pressed", String(this.holdToRun));
-    find("plan-procedure").disabled = !may || active || !this.chosen;
+    find("plan-procedure").disabled = !may || active || !this.chosen || !graph.needle; // a plan begins at the needle
     find("run-procedure").disabled = !(may && graph.bridge?.armed && (state === "ready" || (state === "paused" && !resumes)));
     write("run-procedure", state === "paused" ? "Resume" : "Run");
     find("pause-procedure").disabled = !(open && canCommand && (state === "running" || (state === "paused" && resumes)));
