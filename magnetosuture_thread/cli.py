@@ -38,6 +38,7 @@ COMMANDS = {
     "calibrate-camera": "find where the dish is in the camera's image",
     "calibrate-coils": "find the coils' properties from probe measurements",
     "commission": "let a rig measure its coils, its needle and its delay",
+    "commission-thread": "let a commissioned rig measure its thread",
     "campaign": "run an autonomous procedure in the simulated closed loop, once for each seed",
     "scene": "check a scene file, or draw it",
     "bag": "check a recorded bag, or repair it",

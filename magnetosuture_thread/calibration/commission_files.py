@@ -273,18 +273,32 @@ def write_setup(folder: Path, result: Commissioned, setup: Setup, date: str) -> 
             "motion_delay": rig.delay,
         },
     }
-    sections: dict[str, dict[str, Any]] = {}
-    for key, values in (*read_sections(setup.path), *changes.items()):
-        sections.setdefault(key, {}).update(values)
-    key = f"{EVERY_NODE}/{RigSettings.GROUP}"
+    sections, key = changed_sections(setup.path, changes), f"{EVERY_NODE}/{RigSettings.GROUP}"
     sections[key] = {**simulated, **sections.get(key, {})}
-    text = yaml.safe_dump({key: {PARAMETERS: values} for key, values in sections.items()}, sort_keys=False)
+    text = setup_text(sections)
     with whole_file(path) as partial:
         partial.write_text(CoilCalibration(setup.name, date, notes, tuple(coils)).to_yaml(), encoding="utf-8")
     with whole_file(folder / SETUP_FILE) as partial:
         partial.write_text(f"# {setup.name}, commissioned {date}; see {SUMMARY_FILE}.\n{text}", encoding="utf-8")
         read_setup(str(partial))
     return folder / SETUP_FILE
+
+
+def changed_sections(path: Path, changes: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the parameters of a setup's file by section, with some of them changed.
+
+    Raises:
+        ConfigurationError: the file cannot be read.
+    """
+    sections: dict[str, dict[str, Any]] = {}
+    for key, values in (*read_sections(path), *changes.items()):
+        sections.setdefault(key, {}).update(values)
+    return sections
+
+
+def setup_text(sections: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return parameters by section as the text of a setup's file."""
+    return yaml.safe_dump({key: {PARAMETERS: values} for key, values in sections.items()}, sort_keys=False)
 
 
 def read_rig(folder: Path, believed: CoilBridgeSettings) -> RigParameters:

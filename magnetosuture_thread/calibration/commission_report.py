@@ -39,6 +39,10 @@ SHOWN = {
     "s": (1e3, "ms"),
     "T": (1e6, "µT"),
     "A m^2": (1e3, "mA m²"),
+    "m^4/s": (1e12, "mm⁴/s"),
+    "1/m": (1.0, "1/m"),
+    "N": (1e6, "µN"),
+    "": (1.0, ""),
 }
 
 
@@ -72,7 +76,7 @@ def draw_report(result: Commissioned, setup: Setup, summary: Mapping[str, Any], 
         _draw_ladder(figure, result, 0.60)
     else:
         _draw_verification(figure.add_axes((0.56, 0.645, 0.38, 0.085)), result)
-        _draw_table(figure, values_of(result, setup.coils), 0.60)
+        draw_table(figure, values_of(result, setup.coils), 0.60)
         _draw_history(figure.add_axes((0.10, 0.055, 0.84, 0.10)), result)
         notes = (
             "Gauge: a motion shows only field x moment / drag, so the mean field and the moment are held; one reading\n"
@@ -165,7 +169,7 @@ def _draw_history(axes: Axes, result: Commissioned) -> None:
     axes.legend(fontsize=7.5, frameon=False, loc="upper right", ncol=4, borderaxespad=0.0, bbox_to_anchor=(1.0, 1.25))
 
 
-def _draw_table(figure: Figure, values: Sequence[Value], top: float) -> None:
+def draw_table(figure: Figure, values: Sequence[Value], top: float) -> None:
     """Draw the values with their intervals, and what the setup said."""
     columns = (
         *((0.06, "value", "left"), (0.50, "found", "right"), (0.58, "± 95 %", "right"), (0.70, "setup", "right")),
@@ -178,7 +182,7 @@ def _draw_table(figure: Figure, values: Sequence[Value], top: float) -> None:
         cells.append("" if math.isnan(value.interval) else f"{factor * value.interval:.2g}")
         cells.append("" if math.isnan(value.change) else f"{factor * value.before:.4g}")
         rows.append((value.changed, [*cells, _change(value), value.kind]))
-    _draw_rows(figure, columns, rows, top)
+    draw_rows(figure, columns, rows, top)
 
 
 def _draw_ladder(figure: Figure, result: Commissioned, top: float) -> None:
@@ -193,10 +197,10 @@ def _draw_ladder(figure: Figure, result: Commissioned, top: float) -> None:
         cells += ["towards" if answer.towards else "away", f"{1e3 * answer.speed:.2f} mm/s/A"]
         none = [f"coil {k}", "no answer", "", "", "", ""]
         rows.append((not answer.moved, [*cells, f"{answer.turn_rate:.1f} rad/s/A"] if answer.moved else none))
-    _draw_rows(figure, columns, rows, top)
+    draw_rows(figure, columns, rows, top)
 
 
-def _draw_rows(
+def draw_rows(
     figure: Figure, columns: Sequence[tuple[float, str, str]], rows: Sequence[tuple[bool, list[str]]], top: float
 ) -> None:
     """Draw a table: place, name and side of each column, and of each row whether it is bold, and its cells."""

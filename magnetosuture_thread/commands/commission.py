@@ -1,4 +1,4 @@
-"""The command `magnetosuture commission`: a rig measures its coils, its needle and its delay by its own camera."""
+"""The commands `magnetosuture commission` and `commission-thread`: a rig measures itself by its own camera."""
 
 from __future__ import annotations
 
@@ -13,14 +13,20 @@ from typing import Any
 
 import numpy as np
 
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.calibration import commission_files as files
 from magnetosuture_thread.calibration.commission import Commissioning
 from magnetosuture_thread.calibration.simulated_bench import SimulatedBench
+from magnetosuture_thread.calibration.simulated_thread import SimulatedThreadBench
+from magnetosuture_thread.calibration.thread_step import PAGE_FILE, ThreadCommissioning, read_commissioned, write_thread
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.rig.truth import with_rig
+from magnetosuture_thread.settings.configuration import read_yaml
 from magnetosuture_thread.settings.errors import BagError
+
+DRAWN = "poses drawn with a tracker's noise"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +72,7 @@ def run_commission(options: argparse.Namespace, terminal: command.Terminal) -> i
         raise BagError(folder, "holds a finished commissioning; choose another folder")
     setup = read_setup(options.setup)
     notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8"), "seed": str(options.seed)}
-    poses = "poses drawn with a tracker's noise" if options.drawn_poses else "poses tracked in rendered frames"
+    poses = DRAWN if options.drawn_poses else "poses tracked in rendered frames"
     notes["rig"] = "a rig that runs" if options.live else poses
     if not options.live:
         notes["simulated"] = f"the rig {options.rig or 'of the setup'}, {poses}"
@@ -126,6 +132,55 @@ def _check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     for words in changed or ["the rig is still the one that was measured"]:
         terminal.log(words)
     return command.FAILED if changed else command.DONE
+
+
+def add_thread(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    option = parser.add_argument
+    option("folder", type=Path, metavar="DIR", help="of a commissioning that passed, on the same rig")
+    option("--seed", type=command.whole_number, default=0, help="of a simulated tracker's noise (default: 0)")
+
+
+def run_commission_thread(options: argparse.Namespace, terminal: command.Terminal) -> int:
+    """Measure the thread of a rig that was commissioned.
+
+    The thread is tied to the needle, in the empty dish. The needle draws it through straight pulls and turns, to which
+    the thread's parameters are fitted as by calibrate. The force of the coils in the pulls, less what the bare needle
+    took, is the thread's drag. With what was found, the thread of other pulls is predicted, and a square followed.
+
+    The rig is simulated as that of DIR was: drawn poses, or rendered frames. A rig that runs needs the steps by hand.
+
+    DIR gets
+      thread.yaml    the thread's parameters, for thread_model, and
+      setup.yaml     is changed by them, thread_drag, needle_drag and max_pull: both only if the verification passed
+      summary.json   in it, verdict, limits and values of the thread with their intervals
+      thread.pdf     the same on one page, with the error of the prediction
+      thread/NNN     a bag of each run, numbered on
+    """
+    folder: Path = options.folder
+    setup, _ = read_commissioned(folder)
+    path = folder / files.SUMMARY_FILE
+    summary = read_yaml(path, "summary of a commissioning")
+    if not summary["simulated"]:
+        raise ConfigurationError("simulated", False, "true: a rig that runs is not driven by this command", str(path))
+    rig, drawn = summary["rig"], summary["poses"] == DRAWN
+    truth = with_rig(setup, "" if rig == summary["setup"] else rig)
+    bench = SimulatedThreadBench(truth, drawn=drawn, seed=options.seed)
+    result = ThreadCommissioning(folder, bench, terminal.log).run()
+    part = write_thread(folder, result, setup, datetime.date.today().isoformat())
+    rows = [
+        (value.name, *_cells(value.value, value.interval, value.before), value.unit, value.kind)
+        for value in result.values
+    ]
+    columns = ("value", "found", "95 % ±", "before", "unit", "known by")
+    terminal.print(command.make_table(f"thread of {summary['setup']} (simulated)", columns, rows))
+    for line in (*part.get("warnings", ()), *result.failures):
+        terminal.log(line)
+    if result.prediction is not None and (errors := result.prediction.after["seen"]):
+        figures = f"mean {errors['mean']:.3g}, maximum {errors['maximum']:.3g} % of the length"
+        terminal.log(f"prediction of the run that was not fitted: {figures}")
+    terminal.log(f"verdict: {part['verdict']}; {folder / PAGE_FILE}")
+    return command.FAILED if result.failures else command.DONE
 
 
 def _cells(*numbers: float) -> list[str]:
