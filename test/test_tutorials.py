@@ -136,8 +136,9 @@ def test_blocks_on_the_graph_run(page: Path, clone: Path):
 
 
 SHOWN = [ROOT / "docs/results.md", ROOT / "docs/reproduction.md", *sorted((ROOT / "docs/how_to").glob("*.md"))]
-# Interactive, or on a robot, or elsewhere: tested by other means.
-NOT_HERE = re.compile(r"magnetosuture (coils|console|compile)|s3://|tcp://|BAG --output DIR$|--live|--bare|output/rig")
+# Interactive, or on a robot, or after another command, or elsewhere: tested by other means.
+VERBS = r"magnetosuture (coils|console|compile|commission-thread)"
+NOT_HERE = re.compile(VERBS + r"|s3://|tcp://|BAG --output DIR$|--live|--bare|output/rig")
 LIVE = re.compile(r"simulate|replay (?!.*--offline)|thread-behavior")
 PLACES = {
     **dict.fromkeys(("BAG", "FRAMES_OR_BAG", "RUNS"), "examples/post_wrap"),

@@ -9,7 +9,8 @@ with the needle's direction e, its velocity v along it and its own drag D, and t
 tangent t along its length. Straight behind the needle A = v and N = 0: T is what the needle needs more than a bare one
 for the same speed, `thread_drag`.
 
-Source: resistive force theory of a slender body without inertia. Deviation: none.
+Source: resistive force theory of a slender body without inertia. Deviation: friction on the dish's floor, which would
+not grow with the speed, counts as drag at the one speed of the pulls.
 """
 
 from __future__ import annotations
