@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,17 @@ from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.geometry.polyline import Vector
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.closed_loop import ClosedLoop, RunBag
-from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings.files import whole_folder
+
+
+class _PoseBag(RunBag):
+    """Records a run without its frames: what they show is tracked already."""
+
+    def on_frame(self, now: float, frame: RigFrame) -> None:
+        """Write the ground truth."""
+        super().on_frame(now, replace(frame, image=None))
 
 
 class SimulatedThreadBench:
@@ -41,7 +50,7 @@ class SimulatedThreadBench:
         notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8")}
         notes["simulated"] = f"a rig with a thread, closed loop in one process, poses {poses}"
         with whole_folder(bag) as folder, BagWriter(folder, notes, name=bag.name) as writer:
-            rig, recorder = Rig(self._rig, setup.scene), RunBag(writer, setup, camera=False)
+            rig, recorder = Rig(self._rig, setup.scene), _PoseBag(writer, setup, camera=False)
             loop = ClosedLoop(setup, rig, steer, self._seed, camera=not self._drawn, recorder=recorder)
             while not (path.done or loop.bridge.latch.fault) and rig.time < path.time_limit:
                 loop.step()

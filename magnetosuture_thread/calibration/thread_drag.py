@@ -30,9 +30,9 @@ from magnetosuture_thread.rig.setups import Setup
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import BagError
 
-HALF_WINDOW = 0.15  # s; a velocity is a difference over twice that: of a tracked end of 10 um, 2 % of the speed
+HALF_WINDOW = 0.15  # s; a velocity is the slope of a line over twice that: of an end tracked to 10 um, 1 % of it
 POINTS = 25  # of the thread
-WHOLE = 0.9  # of the thread's length, which has to be seen
+WHOLE = 0.99  # of the thread's length, which has to be seen: an end that comes and goes would be a motion
 TURN_RATE = 0.4  # rad/s; a needle that turns faster is on no straight pull
 WALL_CLEARANCE = 4e-4  # m; of all of the thread: the wall's force upon it is not measured
 LEAST_PULL = 0.5  # s
@@ -87,6 +87,7 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
     Raises:
         BagError: the bag cannot be used, or has fewer than `LEAST_PULLS` pulls.
     """
+    length = setup.model.thread_length
     given, poses, threads = list[list[float]](), dict[float, Vector](), dict[float, Points]()
     channels = interface.CURRENTS, interface.NEEDLE_POSE, interface.MEASURED_THREAD
     for record in Bag(path).records({channel.recorded for channel in channels}):
@@ -95,15 +96,15 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
             given.append([stamp, *record.decode().current])
         elif record.topic == interface.NEEDLE_POSE.recorded:
             poses[stamp] = np.concatenate(read_pose(record)[:2])
-        elif len(curve := read_path(record)) > 1 and arc_lengths(curve)[-1] > WHOLE * setup.model.thread_length:
-            threads[stamp] = points_at(curve, np.linspace(0.0, arc_lengths(curve)[-1], POINTS + 1))
+        elif len(curve := read_path(record)) > 1 and (seen := arc_lengths(curve)[-1]) > WHOLE * length:
+            threads[stamp] = points_at(curve, np.minimum(seen, np.linspace(0.0, length, POINTS + 1)))
     times = np.array(sorted(poses.keys() & threads.keys()))
     if len(given) < 2 or len(times) < 20:
         raise BagError(path, f"has {len(given)} currents, and {len(times)} frames with needle and whole thread")
     pose, nodes = np.array([poses[t] for t in times]), np.array([threads[t] for t in times])
     w = max(1, round(HALF_WINDOW / float(np.median(np.diff(times)))))
     span, inside = times[2 * w :] - times[: -2 * w], slice(w, -w)
-    velocity = (nodes[2 * w :] - nodes[: -2 * w]) / span[:, None, None]
+    velocity = _slopes(nodes, times, w)
     angle = np.unwrap(np.arctan2(pose[:, 3], pose[:, 2]))
     turn_rate = (angle[2 * w :] - angle[: -2 * w]) / span
     times, pose, nodes = times[inside], pose[inside], nodes[inside]
@@ -124,6 +125,15 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
     force = _force(np.array(given), times[chosen], pose[chosen, :2], e[chosen], setup)
     index = np.repeat(np.arange(len(kept)), [len(run) for run in kept])
     return Pulls(times[chosen], force, speed[chosen], thread[chosen], index)
+
+
+def _slopes(values: Vector, times: Vector, w: int) -> Vector:
+    """Return the slope of the line through 2 w + 1 values around each but the first and last w of them."""
+    count = len(times) - 2 * w
+    numbers = np.array([times[k : k + count] for k in range(2 * w + 1)])
+    numbers -= numbers.mean(axis=0)
+    numbers /= (numbers**2).sum(axis=0)
+    return np.asarray(sum(np.einsum("k,k...->k...", numbers[k], values[k : k + count]) for k in range(2 * w + 1)))
 
 
 def _force(given: Vector, times: Vector, tails: Points, e: Points, setup: Setup) -> Vector:

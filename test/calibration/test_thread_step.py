@@ -13,6 +13,7 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
+from magnetosuture_thread.calibration.simulated_thread import SimulatedThreadBench
 from magnetosuture_thread.calibration.square import TipPath, pulls
 from magnetosuture_thread.calibration.thread_drag import Pulls, measure_drag
 from magnetosuture_thread.calibration.thread_step import (
@@ -122,6 +123,21 @@ def test_a_commissioning_that_was_refused_has_no_thread(tmp_path: Path):
     with pytest.raises(ConfigurationError, match="commission the bare needle first"):
         read_commissioned(tmp_path)
     assert main(["commission-thread", str(tmp_path)]) == 2
+
+
+@pytest.mark.slow
+def test_rendered_frames_are_tracked_and_not_kept(tmp_path: Path):
+    setup = read_setup(SETUP)
+    way = np.array([[0.011, -0.004], [0.013, -0.003]])
+    bench = SimulatedThreadBench(setup)
+    apart, problem = bench.follow(TipPath(setup.coils.needle_length, way), setup, tmp_path / "run")
+    assert problem == ""
+    assert apart < 1e-3
+    counts = Bag(tmp_path / "run").counts
+    assert interface.COMPRESSED_IMAGE.recorded not in counts
+    frames = counts[interface.GROUND_TRUTH_NEEDLE.recorded]
+    for channel in (interface.NEEDLE_POSE, interface.MEASURED_THREAD):
+        assert 0.9 * frames < counts[channel.recorded] <= frames
 
 
 @pytest.fixture(scope="module", params=[3, 5])
