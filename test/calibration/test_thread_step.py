@@ -140,7 +140,7 @@ def test_rendered_frames_are_tracked_and_not_kept(tmp_path: Path):
         assert 0.9 * frames < counts[channel.recorded] <= frames
 
 
-@pytest.fixture(scope="module", params=[3, 5])
+@pytest.fixture(scope="module", params=[3])
 def threaded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RigSettings]:
     """Return the folder of a commissioning with its thread, and the true rig."""
     name = f"random:{request.param}"
