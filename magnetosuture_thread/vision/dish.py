@@ -20,7 +20,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, shrunk
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSettings
 
-COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
+COARSE_SIDE = 240  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
 MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
 BINS = 72  # directions
 ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
@@ -118,22 +118,19 @@ def find_rings(image: np.ndarray) -> list[Ellipse]:
     if max(size) > 4 * COARSE_SIDE:  # no frame of a camera
         return []
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1.0 else image
-    edges = _edges_of(small)
-    found = _candidates(edges, 1.0, 0.0)
-    for way in range(4):
+    edges, found = _edges_of(small), list[tuple[float, float, Ellipse]]()
+    for ratio, way in ((1.0, 0), *((0.9, way) for way in range(4))):
+        found += _candidates(measured_channel(small), edges, ratio, 0.25 * math.pi * way)
         if found and max(share for _, share, _ in found) >= 0.8:
             break
-        found += _candidates(edges, 1.0 / 0.9, 0.25 * math.pi * way)
     if not found:
         return []
     at = max(found, key=lambda each: each[0])[2].scaled(image.shape[1] / small.shape[1])
-    factor = max(1, round(min(image.shape[:2]) / (6 * COARSE_SIDE)))
+    factor = max(1, round(min(image.shape[:2]) / (4 * COARSE_SIDE)))
     gray, first = shrunk(measured_channel(image), factor), at.scaled(1.0 / factor)
     radius = 0.5 * (first.major + first.minor)  # It may lie across several, and look tilted by that.
-    sets = [_rings_around(gray, each) for each in (first, replace(first, major=radius, minor=radius))]
-    sets += [_rings_around(gray, max(each, key=lambda ring: ring[0])[1]) for each in sets if each]
-    # Strong rings speak for an ellipse; weak ones are there by chance.
-    rings = max(sets, key=lambda each: sum(support**4 for support, _ in each))
+    starts = first, replace(first, major=radius, minor=radius)
+    rings = max((_climbed(gray, each, SUPPORT) for each in starts), key=_evidence)
     return sorted((ring.scaled(float(factor)) for _, ring in rings), key=lambda ring: ring.major)
 
 
@@ -181,26 +178,45 @@ class _Steps:
         """
         shift, ways = np.linspace(-PARALLAX, PARALLAX, 11), unit_vectors(RAYS)[self.way]
         shifts = np.stack(np.meshgrid(shift, shift), axis=-1).reshape(-1, 2)
-        count = int(2.0 * RANGE / FINE_AGREEMENT) + 1
-        cells = np.floor((self.radius[left] - shifts @ ways[left].T - 1.0 + RANGE) / FINE_AGREEMENT).astype(int)
+        cell = max(FINE_AGREEMENT, 0.5 / self.at.minor)
+        count = int(2.0 * RANGE / cell) + 1
+        cells = np.floor((self.radius[left] - shifts @ ways[left].T - 1.0 + RANGE) / cell).astype(int)
         inside = (cells >= 0) & (cells < count)
         cells += count * (np.arange(len(shifts))[:, None] + len(shifts) * self.rises[left])
         votes = np.bincount(cells[inside], minlength=2 * count * len(shifts)).reshape(2, -1, count)
         votes = votes[..., :-2] + votes[..., 1:-1] + votes[..., 2:]
-        rises, best, cell = np.unravel_index(int(votes.argmax()), votes.shape)
-        radius = 1.0 - RANGE + FINE_AGREEMENT * (cell + 1.5)
+        rises, best, first = np.unravel_index(int(votes.argmax()), votes.shape)
+        radius = 1.0 - RANGE + cell * (first + 1.5)
         u, v = self.at.at(shifts[best])
         ring = replace(self.at, centre_px=(u, v), major=self.at.major * radius, minor=self.at.minor * radius)
         apart = np.abs(self.radius - ways @ shifts[best] - radius)
-        return ring, left & (self.rises == rises) & (apart < AGREEMENT), int(votes[rises, best, cell])
+        return ring, left & (self.rises == rises) & (apart < 2.0 * cell), int(votes[rises, best, first])
 
 
 def _within(points: Points, shape: tuple[int, ...]) -> np.ndarray:
     """Say which points, of shape (..., 2), lie in an image of a shape (rows, columns), shape (...)."""
-    return np.asarray(((points >= 1.0) & (points <= np.array(shape[1::-1]) - 2.0)).all(axis=-1))
+    u, v = points[..., 0], points[..., 1]  # numpy is slow along a short last axis
+    return np.asarray((u >= 1.0) & (u <= shape[1] - 2.0) & (v >= 1.0) & (v <= shape[0] - 2.0))
 
 
-def _rings_around(gray: Gray, at: Ellipse) -> list[tuple[float, Ellipse]]:
+def _evidence(rings: list[tuple[float, Ellipse]]) -> float:
+    """Return how much rings speak for a dish: strong ones do, weak ones are there by chance."""
+    return sum(support**4 for support, _ in rings)
+
+
+def _climbed(gray: Gray, at: Ellipse, needed: float) -> list[tuple[float, Ellipse]]:
+    """Return the rings near an ellipse, and from the strongest of them on as long as others speak for it more."""
+    best = _rings_around(gray, at, needed)
+    while best:
+        starts = max(best, key=lambda each: each[0])[1], min(best, key=lambda each: each[1].major)[1]
+        rings = max((_rings_around(gray, each, needed) for each in dict.fromkeys(starts)), key=_evidence)
+        if _evidence(rings) <= _evidence(best):
+            break
+        best = rings
+    return best
+
+
+def _rings_around(gray: Gray, at: Ellipse, needed: float) -> list[tuple[float, Ellipse]]:
     """Find the edges of wall and lid near an ellipse, each with the share of the directions in which it is seen.
 
     They are circles one above the other: in units of the ellipse's axes each is nearly a circle, shifted by what the
@@ -223,7 +239,7 @@ def _rings_around(gray: Gray, at: Ellipse) -> list[tuple[float, Ellipse]]:
         agree = np.unique(steps.way[apart < max(FINE_AGREEMENT, 1.0 / ellipse.major)])
         outline = ellipse.seen(gray.shape, RAYS)
         support = min(1.0, len(agree) / max(1, int(outline.sum())))
-        if support >= SUPPORT + 0.5 * (1.0 - float(outline.mean())):
+        if support >= needed + 0.5 * (1.0 - float(outline.mean())):
             found.append((support, ellipse))
     return found
 
@@ -244,7 +260,7 @@ def fitted_robustly(points: Points, begin: Ellipse) -> Ellipse | None:
 
 
 def _edges_of(image: np.ndarray) -> _Edges:
-    """Return the points of an image whose gradient is greatest along its own direction, at most 3000."""
+    """Return the points of an image whose gradient is greatest along its own direction, at most 4500."""
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     along_u, along_v = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
     strength = np.hypot(along_u, along_v)
@@ -257,23 +273,38 @@ def _edges_of(image: np.ndarray) -> _Edges:
     right, down = np.rint(normals).astype(int).T
     thin = (value >= strength[rows + down, columns + right]) & (value > strength[rows - down, columns - right])
     chosen = np.flatnonzero(thin)
-    chosen = np.sort(chosen[np.argsort(value[chosen], kind="stable")[-3000:]])  # The weak ones are texture.
+    chosen = np.sort(chosen[np.argsort(value[chosen], kind="stable")[-4500:]])  # The weak ones are texture.
     return _Edges(
         np.column_stack([columns, rows])[chosen].astype(float), normals[chosen].astype(float), image.shape[:2]
     )
 
 
-def _candidates(edges: _Edges, ratio: float, direction: float) -> list[tuple[float, float, Ellipse]]:
-    """Return ellipses with their scores and supports, of edges stretched in a direction by a ratio."""
+def _candidates(gray: Gray, edges: _Edges, ratio: float, direction: float) -> list[tuple[float, float, Ellipse]]:
+    """Return rings with their scores and supports, around centres that edges vote for if a dish is seen as an ellipse.
+
+    Args:
+        gray: image.
+        edges: of it.
+        ratio: of the ellipse's shorter axis to its longer one.
+        direction: of the shorter one [rad].
+    """
+    side, found = min(gray.shape), list[tuple[float, float, Ellipse]]()
     along = np.array([math.cos(direction), math.sin(direction)])
-    stretch = np.eye(2) + (ratio - 1.0) * np.outer(along, along)
+    stretch = np.eye(2) + (1.0 / ratio - 1.0) * np.outer(along, along)
     back = np.linalg.inv(stretch)
     normals = edges.normals @ back
     moved = _Edges(edges.points @ stretch, normals / np.hypot(*normals.T)[:, None], edges.shape)
-    found = list[tuple[float, float, Ellipse]]()
-    for centre in _centres(moved, ratio):
-        found += _around(edges, moved, centre, back)
-        if found and found[-1][1] > 0.95:
+    growth = (1.0 + RANGE) / (1.0 - RANGE)
+    steps = np.arange(math.ceil(math.log(MAX_RADIUS / MIN_RADIUS) / math.log(growth)))
+    for centre in _centres(moved, 1.0 / ratio):
+        u, v = centre @ back
+        for major in MIN_RADIUS * side * growth ** (steps + 0.5):
+            rings = _climbed(gray, Ellipse((u, v), major, ratio * major, direction), 0.5 * SUPPORT)
+            support, ring = max(rings, key=lambda each: each[0], default=(0.0, None))
+            if ring is None or support < 0.8 * SUPPORT or (seen := float(ring.seen(gray.shape, BINS).mean())) < 0.4:
+                continue
+            found.append((_evidence(rings) * math.sqrt(seen) * (ring.major / side) ** 0.25, support, ring))
+        if found and max(share for _, share, _ in found) > 0.95:
             break
     return found
 
@@ -283,14 +314,15 @@ def _centres(edges: _Edges, ratio: float) -> list[Points]:
 
     The image was stretched by a ratio in some direction.
     """
-    side, size, cell = min(edges.shape), np.array(edges.shape[::-1]), 2.0  # px
+    side, size, cell = min(edges.shape), np.array(edges.shape[::-1]), 3.0  # px
     low = -0.15 * side - (ratio - 1.0) * size
     wide, tall = np.ceil((size + 0.15 * side + 2.0 * (ratio - 1.0) * size - low) / cell).astype(int)
     radii = np.arange(MIN_RADIUS * side, MAX_RADIUS * side, cell)
-    steps = np.concatenate([-radii, radii])[:, None, None]
-    cells = np.floor((edges.points + steps * edges.normals - low) / cell).astype(int).reshape(-1, 2)
-    cells = cells[((cells >= 0) & (cells < (wide, tall))).all(axis=1)]
-    votes = np.bincount(cells[:, 1] * wide + cells[:, 0], minlength=wide * tall).reshape(tall, wide)
+    steps = np.concatenate([-radii, radii])[:, None] / cell
+    begin, ahead = (edges.points - low) / cell, edges.normals
+    columns, rows = (np.floor(begin[:, axis] + steps * ahead[:, axis]).astype(int) for axis in (0, 1))
+    inside = (columns >= 0) & (columns < wide) & (rows >= 0) & (rows < tall)
+    votes = np.bincount(rows[inside] * wide + columns[inside], minlength=wide * tall).reshape(tall, wide)
     votes = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), 1.5)
     votes -= cv2.blur(votes, (31, 31))
     found = []
@@ -299,104 +331,6 @@ def _centres(edges: _Edges, ratio: float) -> list[Points]:
         votes[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5] = -np.inf
         found.append(low + cell * (np.array([column, row]) + 0.5))
     return found
-
-
-def _around(edges: _Edges, moved: _Edges, centre: Points, back: np.ndarray) -> list[tuple[float, float, Ellipse]]:
-    """Return the ellipses around a centre with their scores and supports.
-
-    Args:
-        edges: of the image.
-        moved: the same in the stretched image.
-        centre: in the stretched image, shape (2,) [px].
-        back: matrix that takes points of the stretched image back, shape (2, 2).
-    """
-    smallest, largest = MIN_RADIUS * min(edges.shape), MAX_RADIUS * min(edges.shape)
-    ratio = 1.03  # of the radii of a ring
-    offset = moved.points - centre
-    away = np.hypot(*offset.T)
-    facing = np.abs((offset * moved.normals).sum(axis=1)) > ALIGNMENT * away
-    rings = (np.log(np.maximum(away, 1e-9) / smallest) / math.log(ratio)).astype(int)
-    marks = np.zeros((int(math.log(largest / smallest) / math.log(ratio)) + 2, BINS), np.bool_)
-    inside = facing & (away >= smallest) & (rings < len(marks))
-    marks[rings[inside], _sectors(offset[inside])] = True
-    spread = marks.copy()  # An ellipse is no circle: it lies in several rings.
-    for shift in (1, 2):
-        spread[shift:] |= marks[:-shift]
-        spread[:-shift] |= marks[shift:]
-    support = spread.sum(axis=1)
-    found = []
-    for _ in range(2):
-        ring = int(support.argmax())
-        if support[ring] < 0.35 * BINS:
-            break
-        support[max(0, ring - 4) : ring + 5] = 0
-        radius = smallest * ratio ** (ring + 0.5)
-        some = np.flatnonzero(facing & (np.abs(away - radius) < 0.14 * radius))
-        points = _through(offset[some[:: 1 + len(some) // 300]], max(0.8, AGREEMENT * radius))
-        ellipse = _fitted((centre + points) @ back) if points is not None else None
-        if ellipse is None:
-            continue
-        share, seen = _support(edges, ellipse)
-        if seen >= 0.5 and share >= SUPPORT + 0.5 * (1.0 - seen):  # Of a short arc chance is more.
-            score = share * math.sqrt(seen) * (ellipse.major / min(edges.shape)) ** 0.25
-            found.append((score, share, ellipse))
-    return found
-
-
-def _sectors(offsets: Points) -> np.ndarray:
-    """Return in which of `BINS` directions offsets lie, shape (m,)."""
-    return ((np.arctan2(offsets[:, 1], offsets[:, 0]) / (2.0 * np.pi) + 1.0) * BINS).astype(int) % BINS
-
-
-def _support(edges: _Edges, ellipse: Ellipse) -> tuple[float, float]:
-    """Return in which share of the directions in the frame edges agree with an ellipse, and the share in the frame."""
-    inside = ellipse.seen(edges.shape, BINS)
-    at = ellipse.coordinates(edges.points)
-    normal = at / (ellipse.minor, ellipse.major)
-    facing = np.abs((normal * (edges.normals @ ellipse.axes.T)).sum(axis=1)) > ALIGNMENT * np.hypot(*normal.T)
-    agree = facing & (np.abs(np.hypot(*at.T) - 1.0) < max(0.8 / ellipse.major, AGREEMENT))
-    marks = np.zeros(BINS, bool)
-    marks[_sectors(at[agree])] = True
-    return float((marks & inside).sum() / max(1, inside.sum())), float(inside.mean())
-
-
-def _through(offsets: Points, tolerance: float) -> Points | None:
-    """Return points of the ellipse near a centre that edges in the most directions agree on, by random samples of five.
-
-        r(t) = c_0 + c_1 cos t + c_2 sin t + c_3 cos 2t + c_4 sin 2t
-
-    Args:
-        offsets: of the edges from the centre, shape (m, 2).
-        tolerance: between an edge and the ellipse, in their unit.
-
-    Returns:
-        Offsets of `BINS` points from the centre, shape (BINS, 2); None where no edges agree.
-    """
-    if len(offsets) < 20:
-        return None
-    basis, radii = _harmonics(np.arctan2(offsets[:, 1], offsets[:, 0])), np.hypot(*offsets.T)
-    sectors = _sectors(offsets)
-    picked = np.random.default_rng(0).integers(0, len(offsets), (1000, 5))
-    spread = np.diff(np.sort(sectors[picked], axis=1), axis=1).min(axis=1) > 2  # directions apart
-    picked = picked[spread][:400]
-    picked = picked[np.abs(np.linalg.det(basis[picked])) > 1e-3]
-    shapes = np.linalg.solve(basis[picked], radii[picked][..., None])[..., 0]
-    eccentric, flat = np.hypot(shapes[:, 1], shapes[:, 2]), np.hypot(shapes[:, 3], shapes[:, 4])
-    shapes = shapes[(eccentric < 0.2 * shapes[:, 0]) & (flat < 0.12 * shapes[:, 0])]
-    if not len(shapes):
-        return None
-    sample, edge = np.nonzero(np.abs(shapes @ basis.T - radii) < tolerance)
-    marks = np.zeros((len(shapes), BINS), np.bool_)
-    marks[sample, sectors[edge]] = True
-    turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
-    best = _harmonics(turns) @ shapes[marks.sum(axis=1).argmax()]
-    return np.asarray(best[:, None] * unit_vectors(BINS))
-
-
-def _harmonics(turns: np.ndarray) -> np.ndarray:
-    """Return the functions of `_through` at some angles, shape (m, 5)."""
-    waves = np.cos(turns), np.sin(turns), np.cos(2.0 * turns), np.sin(2.0 * turns)
-    return np.column_stack([np.ones_like(turns), *waves])
 
 
 def _fitted(points: Points) -> Ellipse | None:
