@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -20,14 +20,14 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Gray, measured_channel, median, middle, sampled, shrunk
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSettings
 
-COARSE_SIDE = 240  # rows or columns of the image in which an ellipse is looked for; six times as many for its rings
+COARSE_SIDE = 240  # rows or columns of the image in which candidates are looked for; four times as many for the dish
 MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
 BINS = 72  # directions
-ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
 AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
 RANGE = 0.21  # of a ring's radius, within which others of its wall and lid are: a lid is up to 18 % larger
 PARALLAX = 0.08  # of the radius, that a lid's ring is shifted by: 15 mm above the floor of 90 mm, tilted by 13 degrees
 SUPPORT = 0.6  # share of the directions in which a ring must be seen
+MIN_SEEN = 0.4  # share of a dish's rim that the frame must show
 
 RAYS = 180  # along which rings and a wall are measured
 AGREEMENT_PX = 2.0
@@ -107,8 +107,8 @@ def find_rings(image: np.ndarray) -> list[Ellipse]:
 
     In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
     is stretched in a few directions, in which the ellipse of a tilted camera is nearly a circle. Around the centres
-    with the most votes, random samples of five edges give ellipses, and the one is kept that edges in the most
-    directions agree on, within a share of its radius. Around it the image itself is searched for all rings.
+    with the most votes rings of all sizes are looked for. Where they speak most for a dish, the image itself is
+    searched in the same way.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3), uint8.
@@ -119,18 +119,15 @@ def find_rings(image: np.ndarray) -> list[Ellipse]:
         return []
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1.0 else image
     edges, found = _edges_of(small), list[tuple[float, float, Ellipse]]()
-    for ratio, way in ((1.0, 0), *((0.9, way) for way in range(4))):
+    for ratio, way in ((1.0, 0), *((0.9, way) for way in range(4))):  # the latter nearest to tilts of 26 degrees
         found += _candidates(measured_channel(small), edges, ratio, 0.25 * math.pi * way)
-        if found and max(share for _, share, _ in found) >= 0.8:
+        if any(share >= 0.8 for _, share, _ in found):
             break
     if not found:
         return []
     at = max(found, key=lambda each: each[0])[2].scaled(image.shape[1] / small.shape[1])
     factor = max(1, round(min(image.shape[:2]) / (4 * COARSE_SIDE)))
-    gray, first = shrunk(measured_channel(image), factor), at.scaled(1.0 / factor)
-    radius = 0.5 * (first.major + first.minor)  # It may lie across several, and look tilted by that.
-    starts = first, replace(first, major=radius, minor=radius)
-    rings = max((_climbed(gray, each, SUPPORT) for each in starts), key=_evidence)
+    rings = _climbed(shrunk(measured_channel(image), factor), at.scaled(1.0 / factor), SUPPORT)
     return sorted((ring.scaled(float(factor)) for _, ring in rings), key=lambda ring: ring.major)
 
 
@@ -168,29 +165,48 @@ class _Steps:
         radius = radii[row + 2] + 0.5 * step * (before - after) / (before - 2.0 * top + after)
         return _Steps(at, radius, way, change[row + 1, way] > 0.0)
 
+    @cached_property
+    def _cells(self) -> np.ndarray:
+        """Number of the cell of each for each of `_shifts()`; the last of a row for all beyond, shape (shifts, m)."""
+        cells = np.floor((self.radius - _shifts() @ unit_vectors(RAYS)[self.way].T - 1.0 + RANGE) / self._cell)
+        cells = np.where((cells >= 0.0) & (cells < self._count), cells, float(self._count)).astype(np.int32)
+        first = np.arange(len(_shifts()), dtype=np.int32)[:, None] + len(_shifts()) * self.rises.astype(np.int32)
+        return np.asarray(cells + (self._count + 1) * first)
+
+    @property
+    def _cell(self) -> float:
+        """Breadth of a cell of radii, of the radius: half a pixel at least."""
+        return max(FINE_AGREEMENT, 0.5 / self.at.minor)
+
+    @property
+    def _count(self) -> int:
+        return int(2.0 * RANGE / self._cell) + 1
+
     def most_agreed(self, left: np.ndarray) -> tuple[Ellipse, np.ndarray, int]:
-        """Return the ring that most of those left agree on, roughly, those within `AGREEMENT` of it, and their number.
+        """Return the ring that most of those left agree on, roughly, those within two cells of it, and their number.
 
             r = r_0 + a cos t + b sin t
 
-        for r_0 in cells of `FINE_AGREEMENT`, and all shifts (a, b) up to `PARALLAX`. Rings that are next to each other
-        rise and fall in turn: those that do the one and the other are not counted together.
+        for r_0 in cells, and all shifts (a, b) up to `PARALLAX`. Rings that are next to each other rise and fall in
+        turn: those that do the one and the other are not counted together.
         """
-        shift, ways = np.linspace(-PARALLAX, PARALLAX, 11), unit_vectors(RAYS)[self.way]
-        shifts = np.stack(np.meshgrid(shift, shift), axis=-1).reshape(-1, 2)
-        cell = max(FINE_AGREEMENT, 0.5 / self.at.minor)
-        count = int(2.0 * RANGE / cell) + 1
-        cells = np.floor((self.radius[left] - shifts @ ways[left].T - 1.0 + RANGE) / cell).astype(int)
-        inside = (cells >= 0) & (cells < count)
-        cells += count * (np.arange(len(shifts))[:, None] + len(shifts) * self.rises[left])
-        votes = np.bincount(cells[inside], minlength=2 * count * len(shifts)).reshape(2, -1, count)
-        votes = votes[..., :-2] + votes[..., 1:-1] + votes[..., 2:]
+        shifts, count = _shifts(), self._count
+        cells = self._cells[:, left].ravel()
+        votes = np.bincount(cells, minlength=2 * (count + 1) * len(shifts)).reshape(2, len(shifts), count + 1)
+        votes = votes[..., :-3] + votes[..., 1:-2] + votes[..., 2:-1]
         rises, best, first = np.unravel_index(int(votes.argmax()), votes.shape)
-        radius = 1.0 - RANGE + cell * (first + 1.5)
+        radius = 1.0 - RANGE + self._cell * (first + 1.5)
         u, v = self.at.at(shifts[best])
         ring = replace(self.at, centre_px=(u, v), major=self.at.major * radius, minor=self.at.minor * radius)
-        apart = np.abs(self.radius - ways @ shifts[best] - radius)
-        return ring, left & (self.rises == rises) & (apart < 2.0 * cell), int(votes[rises, best, first])
+        apart = np.abs(self.radius - unit_vectors(RAYS)[self.way] @ shifts[best] - radius)
+        return ring, left & (self.rises == rises) & (apart < 2.0 * self._cell), int(votes[rises, best, first])
+
+
+@cache
+def _shifts() -> Points:
+    """Return the shifts of a ring that are tried, of the radius, shape (m, 2)."""
+    shift = np.linspace(-PARALLAX, PARALLAX, 11)
+    return np.stack(np.meshgrid(shift, shift), axis=-1).reshape(-1, 2)
 
 
 def _within(points: Points, shape: tuple[int, ...]) -> np.ndarray:
@@ -205,7 +221,10 @@ def _evidence(rings: list[tuple[float, Ellipse]]) -> float:
 
 
 def _climbed(gray: Gray, at: Ellipse, needed: float) -> list[tuple[float, Ellipse]]:
-    """Return the rings near an ellipse, and from the strongest of them on as long as others speak for it more."""
+    """Return the rings near an ellipse, or near the strongest or the innermost of them, as long as they speak for more.
+
+    See `_rings_around`. In units of a ring's own axes the others are more nearly circles.
+    """
     best = _rings_around(gray, at, needed)
     while best:
         starts = max(best, key=lambda each: each[0])[1], min(best, key=lambda each: each[1].major)[1]
@@ -221,7 +240,7 @@ def _rings_around(gray: Gray, at: Ellipse, needed: float) -> list[tuple[float, E
 
     They are circles one above the other: in units of the ellipse's axes each is nearly a circle, shifted by what the
     camera sees of its height. The one that most changes of the light agree on is fitted by an ellipse and taken out,
-    then the next.
+    then the next. Of a dish that is cut off more than the needed share must be seen: of a short arc chance is more.
     """
     steps = _Steps.around(gray, at)
     points = at.at(steps.radius[:, None] * unit_vectors(RAYS)[steps.way])
@@ -280,12 +299,12 @@ def _edges_of(image: np.ndarray) -> _Edges:
 
 
 def _candidates(gray: Gray, edges: _Edges, ratio: float, direction: float) -> list[tuple[float, float, Ellipse]]:
-    """Return rings with their scores and supports, around centres that edges vote for if a dish is seen as an ellipse.
+    """Return the strongest ring around each centre that edges vote for, with what speaks for it and its own support.
 
     Args:
-        gray: image.
+        gray: the small image.
         edges: of it.
-        ratio: of the ellipse's shorter axis to its longer one.
+        ratio: of the shorter axis to the longer one as the dish is seen.
         direction: of the shorter one [rad].
     """
     side, found = min(gray.shape), list[tuple[float, float, Ellipse]]()
@@ -299,12 +318,15 @@ def _candidates(gray: Gray, edges: _Edges, ratio: float, direction: float) -> li
     for centre in _centres(moved, 1.0 / ratio):
         u, v = centre @ back
         for major in MIN_RADIUS * side * growth ** (steps + 0.5):
+            # In the small image rings next to each other are blurred into one: less is needed than in the image itself.
             rings = _climbed(gray, Ellipse((u, v), major, ratio * major, direction), 0.5 * SUPPORT)
             support, ring = max(rings, key=lambda each: each[0], default=(0.0, None))
-            if ring is None or support < 0.8 * SUPPORT or (seen := float(ring.seen(gray.shape, BINS).mean())) < 0.4:
+            if ring is None or support < 0.8 * SUPPORT:
                 continue
-            found.append((_evidence(rings) * math.sqrt(seen) * (ring.major / side) ** 0.25, support, ring))
-        if found and max(share for _, share, _ in found) > 0.95:
+            seen = float(ring.seen(gray.shape, RAYS).mean())
+            if seen >= MIN_SEEN:
+                found.append((_evidence(rings) * math.sqrt(seen) * (ring.major / side) ** 0.25, support, ring))
+        if any(support > 0.95 for _, support, _ in found):
             break
     return found
 
@@ -513,7 +535,7 @@ def _by_wall(
     shares, farthest = [each.major / radius for each in rings], 1.0 + 2.0 * WALL / diameter
     beyond = replace(inner, major=farthest * radius, minor=farthest * radius).at(unit_vectors(RAYS))
     beyond = beyond[_within(beyond, gray.shape)]
-    if max(count, len(spread)) < needed or seen.mean() < 0.4 or not len(darkest) or not len(beyond):
+    if max(count, len(spread)) < needed or seen.mean() < MIN_SEEN or not len(darkest) or not len(beyond):
         return None
     view = DishView(centre, 0.5 * diameter / radius)
     floor, wall, ground = floor_level(gray, view, diameter), *(middle(sampled(gray, at)) for at in (darkest, beyond))
