@@ -86,9 +86,12 @@ def find_needles(
 
 
 def _axis_alone(candidate: Candidate, size: NeedleSize) -> MeasuredNeedle:
-    """Return a needle of which the axis alone is known, as under glare, against the wall or beside a dimple."""
-    aside = 0.2 * size.width_px  # one deviation
-    along = math.hypot(aside, 0.5 * size.tolerance * size.length_px)
+    """Return a needle of which the axis alone is known, as under glare, against the wall or beside a dimple.
+
+    Where an end is hidden, the answer slides along the axis, whatever is known of the length.
+    """
+    aside = 0.2 * size.width_px  # one deviation, as all of these
+    along = math.hypot(aside, 0.5 * size.tolerance * size.length_px, 0.1 * size.length_px)
     covariance = np.diag([along, aside, 2.0 * math.sqrt(3.0) * aside / size.length_px]) ** 2
     needle = MeasuredNeedle(candidate.arc, size.length_px, size.width_px, direction_is_clear=False)
     return replace(needle, confidence=0.5 * candidate.score, covariance=covariance)
