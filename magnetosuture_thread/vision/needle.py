@@ -33,7 +33,8 @@ CLEARLY = 1.25  # times the cost that the other way has if both could be
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 MAX_MISSING_END, END_ROWS = 0.15, 3  # share of steel that the image may lack at an end, and its rows
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
-BLUNT = 0.7  # bluntness of a tail
+BLUNT, TOO_BLUNT = 0.7, 1.2  # bluntness of a tail; where it is greater, something else is dark beside it
+POINTED = 0.45  # bluntness of a tip
 INSIDE = "inside of a shape of the scene"
 NO_SHAPE = "no needle's shape"
 
@@ -287,12 +288,14 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if fit.cost > CLEARLY * against.cost:
             continue
         tail, tip = _bluntness(steel.perhaps, fit).min(axis=1).tolist()  # where a coloured thread may hide steel
-        if not BLUNT < tail < 1.2 or tip > 0.45:  # Where a tail is blunter, what is dark beside it is something else.
+        if not BLUNT < tail < TOO_BLUNT or tip > POINTED:
             continue
         their_tail, their_tip = _bluntness(steel.perhaps, against).min(axis=1).tolist()
         signs = (their_tail < 0.5) + (their_tip > 0.6)
         needed = (CLEARLY, 1.15, 0.0)[signs]  # times the cost, for as many signs against the other way
-        if tip > 0.32:  # as the wall blunts a tip
+        if their_tail >= TOO_BLUNT and their_tip <= POINTED:  # The other way, too, both ends look as they should.
+            needed = math.inf
+        elif tip > 0.32:  # as the wall blunts a tip
             needed = HOPELESS if signs == 2 else math.inf
         if against.cost > needed * fit.cost:
             return fit

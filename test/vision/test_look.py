@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
@@ -82,3 +83,13 @@ def test_a_place_in_the_frame_of_a_tilted_camera_is_that_in_its_dish(region: tup
     tip = np.linalg.inv(straight) @ [*VIEW.to_pixels(pose.at(1.0)), 1.0]
     assert seen.place_of(tip[:2] / tip[2]) == pytest.approx(pose.at(1.0), abs=1e-3 * PIXEL)
     assert np.linalg.norm(seen.tip - pose.at(1.0)) < 2.0 * PIXEL
+
+
+def test_a_short_needle_beside_whose_tail_its_thread_turns_is_not_told_the_other_way_round():
+    """With a length and a width set 5 % too small, both ways have a blunt tail and a pointed tip."""
+    case, image = frame_of("fold_15_26_2.5mm", 2, 33)
+    needle = case.needle
+    size = {"needle_length": 0.95 * needle.length, "needle_width": 0.95 * needle.width}
+    seen = VisionTracker(VisionTrackerSettings(**size), SCENE).look(image)
+    along = np.array([np.cos(needle.heading), np.sin(needle.heading)])
+    assert seen.state is not State.TRACKED or seen.heading @ along > 0.99
