@@ -22,7 +22,6 @@ from magnetosuture_thread.vision.settings import MIN_SIDE_PX, VisionTrackerSetti
 
 COARSE_SIDE = 240  # rows or columns of the image in which candidates are looked for; four times as many for the dish
 MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
-BINS = 72  # directions
 AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
 RANGE = 0.21  # of a ring's radius, within which others of its wall and lid are: a lid is up to 18 % larger
 PARALLAX = 0.08  # of the radius, that a lid's ring is shifted by: 15 mm above the floor of 90 mm, tilted by 13 degrees
@@ -658,10 +657,11 @@ class DishWatch:
         prepared = self.found.prepared(image)
         view = self.found.view
         radius = 0.5 * self._diameter / view.metres_per_pixel
-        edges, darkest = rim_points(prepared, view.centre_px, radius, 7.0, 1.0, BINS)
+        rays = 72  # fewer than where it is found: this is done in each frame
+        edges, darkest = rim_points(prepared, view.centre_px, radius, 7.0, 1.0, rays)
         circle = fit_circle(darkest if len(darkest) >= len(edges) // 2 else edges, 0.5 * AGREEMENT_PX)
         before, self._anew = self._anew, []
-        if circle is not None and circle[3] >= 0.4 * BINS and math.dist(circle[:2], view.centre_px) < 1.0:  # px
+        if circle is not None and circle[3] >= 0.4 * rays and math.dist(circle[:2], view.centre_px) < 1.0:  # px
             return "", prepared
         found = see_dish(image, self._settings, self._diameter)
         if found is None:
