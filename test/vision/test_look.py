@@ -89,7 +89,7 @@ def test_a_short_needle_beside_whose_tail_its_thread_turns_is_not_told_the_other
     """With a length and a width set 5 % too small, both ways have a blunt tail and a pointed tip."""
     case, image = frame_of("fold_15_26_2.5mm", 2, 33)
     needle = case.needle
-    size = {"needle_length": 0.95 * needle.length, "needle_width": 0.95 * needle.width}
-    seen = VisionTracker(VisionTrackerSettings(**size), SCENE).look(image)
+    settings = VisionTrackerSettings(needle_length=0.95 * needle.length, needle_width=0.95 * needle.width)
+    seen = VisionTracker(settings, SCENE).look(image)
     along = np.array([np.cos(needle.heading), np.sin(needle.heading)])
     assert seen.state is not State.TRACKED or seen.heading @ along > 0.99
