@@ -18,7 +18,13 @@ from magnetosuture_thread.calibration import commission_files as files
 from magnetosuture_thread.calibration.commission import Commissioning
 from magnetosuture_thread.calibration.simulated_bench import SimulatedBench
 from magnetosuture_thread.calibration.simulated_thread import SimulatedThreadBench
-from magnetosuture_thread.calibration.thread_step import PAGE_FILE, ThreadCommissioning, read_commissioned, write_thread
+from magnetosuture_thread.calibration.thread_step import (
+    PAGE_FILE,
+    ThreadBench,
+    ThreadCommissioning,
+    read_commissioned,
+    write_thread,
+)
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.rig.setups import Setup, read_setup
@@ -138,6 +144,8 @@ def add_thread(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     option = parser.add_argument
     option("folder", type=Path, metavar="DIR", help="of a commissioning that passed, on the same rig")
+    option("--live", action="store_true", help="the rig that runs on this ROS domain, with DIR/setup.yaml")
+    option("--namespace", type=command.namespace_argument, default="", metavar="NAME", help="of a rig that runs")
     option("--seed", type=command.whole_number, default=0, help="of a simulated tracker's noise (default: 0)")
 
 
@@ -148,7 +156,8 @@ def run_commission_thread(options: argparse.Namespace, terminal: command.Termina
     the thread's parameters are fitted as by calibrate. The force of the coils in the pulls, less what the bare needle
     took, is the thread's drag. With what was found, the thread of other pulls is predicted, and a square followed.
 
-    The rig is simulated as that of DIR was: drawn poses, or rendered frames. A rig that runs needs the steps by hand.
+    With --live the rig is the one that runs on this ROS domain with DIR/setup.yaml, in a dish without shapes. This
+    command arms it; keep a hand on the switch of the supply. Without it the rig is simulated as that of DIR was.
 
     DIR gets
       thread.yaml    the thread's parameters, for thread_model, and
@@ -159,21 +168,17 @@ def run_commission_thread(options: argparse.Namespace, terminal: command.Termina
     """
     folder: Path = options.folder
     setup, _ = read_commissioned(folder)
-    path = folder / files.SUMMARY_FILE
-    summary = read_yaml(path, "summary of a commissioning")
-    if not summary["simulated"]:
-        raise ConfigurationError("simulated", False, "true: a rig that runs is not driven by this command", str(path))
-    rig, drawn = summary["rig"], summary["poses"] == DRAWN
-    truth = with_rig(setup, "" if rig == summary["setup"] else rig)
-    bench = SimulatedThreadBench(truth, drawn=drawn, seed=options.seed)
-    result = ThreadCommissioning(folder, bench, terminal.log).run()
+    summary = read_yaml(folder / files.SUMMARY_FILE, "summary of a commissioning")
+    with _thread_bench(setup, summary, options) as bench:
+        result = ThreadCommissioning(folder, bench, terminal.log).run()
     part = write_thread(folder, result, setup, datetime.date.today().isoformat())
     rows = [
         (value.name, *_cells(value.value, value.interval, value.before), value.unit, value.kind)
         for value in result.values
     ]
-    columns = ("value", "found", "95 % ±", "before", "unit", "known by")
-    terminal.print(command.make_table(f"thread of {summary['setup']} (simulated)", columns, rows))
+    columns, title = ("value", "found", "95 % ±", "before", "unit", "known by"), f"thread of {summary['setup']}"
+    if rows:
+        terminal.print(command.make_table(title + ("" if options.live else " (simulated)"), columns, rows))
     for line in (*part.get("warnings", ()), *result.failures):
         terminal.log(line)
     if result.prediction is not None and (errors := result.prediction.after["seen"]):
@@ -181,6 +186,22 @@ def run_commission_thread(options: argparse.Namespace, terminal: command.Termina
         terminal.log(f"prediction of the run that was not fitted: {figures}")
     terminal.log(f"verdict: {part['verdict']}; {folder / PAGE_FILE}")
     return command.FAILED if result.failures else command.DONE
+
+
+@contextmanager
+def _thread_bench(setup: Setup, summary: dict[str, Any], options: argparse.Namespace) -> Iterator[ThreadBench]:
+    """Yield the bench of the options."""
+    if not options.live:
+        if not summary["simulated"]:
+            raise ConfigurationError("simulated", False, "true; for a rig that runs, --live", str(options.folder))
+        rig = "" if summary["rig"] == summary["setup"] else summary["rig"]
+        yield SimulatedThreadBench(with_rig(setup, rig), drawn=summary["poses"] == DRAWN, seed=options.seed)
+        return
+    from magnetosuture_thread.nodes.live_bench import LiveThreadBench  # late, as it needs ROS
+    from magnetosuture_thread.nodes.processes import Interruption
+
+    with Interruption() as interruption, LiveThreadBench(setup, interruption.check, options.namespace) as live:
+        yield live
 
 
 def _cells(*numbers: float) -> list[str]:

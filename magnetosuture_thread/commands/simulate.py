@@ -51,6 +51,8 @@ def add(parser: argparse.ArgumentParser) -> None:
     task.add_argument("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
     bare = "a needle without a thread in an empty dish, for commission --live: nothing steers, until Ctrl-C"
     task.add_argument("--bare", action="store_true", help=bare)
+    threaded = "the same with the setup's thread, for commission-thread --live"
+    task.add_argument("--threaded", action="store_true", help=threaded)
     command.add_rig(parser)
     clock = parser.add_mutually_exclusive_group()
     rate = "run with a simulated clock, this much faster than real time (default: in real time)"
@@ -68,10 +70,10 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     the setup's path. All are processes of their own, on a ROS domain that nobody else uses. Everything is
     simulated, and the bag says so.
 
-    With --bare nothing steers: the dish waits for `commission --live`. With --procedure, needle_planner executes it in
-    place of path_follower. Whether it succeeded, or why it failed, is at the end of the table, and in summary.json in
-    BAG; one that waits for a person fails after 30 s, unless somebody resumes it. Where the computer skips a tenth of
-    the frames or more, that is the reason: a lower --rate gives it more time.
+    With --bare and --threaded nothing steers: the dish waits to be commissioned. With --procedure, needle_planner
+    executes it in place of path_follower. Whether it succeeded, or why it failed, is at the end of the table, and in
+    summary.json in BAG; one that waits for a person fails after 30 s, unless somebody resumes it. Where the computer
+    skips a tenth of the frames or more, that is the reason: a lower --rate gives it more time.
 
     SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
     exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
@@ -82,8 +84,8 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     try:
         with terminal.progress("simulate") as advance:
             chosen |= {"log": terminal.log, "progress": advance}
-            if options.bare:
-                host_bare_rig(options.setup, options.output, **chosen)
+            if options.bare or options.threaded:
+                host_rig(options.setup, options.output, threaded=options.threaded, **chosen)
                 return None
             summary = simulate(options.setup, options.output, procedure=options.procedure, **chosen)
     except KeyboardInterrupt:
@@ -174,10 +176,11 @@ def simulate(
     return summary
 
 
-def host_bare_rig(
+def host_rig(
     setup_name: str,
     output: Path,
     *,
+    threaded: bool = False,
     duration: float | None = None,
     rate: float | None = None,
     boards: bool = False,
@@ -185,11 +188,12 @@ def host_bare_rig(
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> None:
-    """Run rig, tracker, model and a bridge that commissions, around a needle without a thread that nothing steers.
+    """Run rig, tracker, model and bridge around a needle that nothing steers, to be commissioned.
 
     Args:
         setup_name: name or path of a setup; its scene is without shapes here.
         output: as of `simulate`, as are the others.
+        threaded: whether there is a thread; without one the bridge gives pulses.
         duration: it ends after this many seconds; with an interruption if None.
         rate: how much faster than real time.
         boards: whether there are simulated boards.
@@ -204,10 +208,11 @@ def host_bare_rig(
         KeyboardInterrupt: passed on; its bag is there.
     """
     believed = read_setup(setup_name)
-    setup = with_rig(believed, rig)
-    bare = bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))
-    setup = replace(setup, rig=bare).with_scene(Scene(setup.scene.dish))
-    _Run(setup, believed.rig, _Bare(), duration, rate, boards, log, progress).write(output)
+    setup = with_rig(believed, rig).with_scene(Scene(believed.scene.dish))
+    if not threaded:
+        bare = bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))
+        setup = replace(setup, rig=bare).with_scene(setup.scene)
+    _Run(setup, believed.rig, _Waiting(gives_pulses=not threaded), duration, rate, boards, log, progress).write(output)
 
 
 def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
@@ -250,11 +255,13 @@ class _Task:
         return ""
 
 
-class _Bare(_Task):
+class _Waiting(_Task):
     """A rig that others commission. The bridge waits for a person to arm it."""
 
-    arguments = live.arguments_of({"coil_bridge:commissioning": "true"})
     stage = 2
+
+    def __init__(self, *, gives_pulses: bool) -> None:
+        self.arguments = live.arguments_of({"coil_bridge:commissioning": "true"}) if gives_pulses else ()
 
 
 class _Path(_Task):

@@ -22,28 +22,32 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.bags import reading
-from magnetosuture_thread.bags.packing import packed_twist
+from magnetosuture_thread.bags.packing import packed_scene, packed_twist
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.calibration.commission import AFTER, BEFORE, PATIENCE
 from magnetosuture_thread.calibration.needle_length import find_needle_length
 from magnetosuture_thread.calibration.pulse_model import Pulse
-from magnetosuture_thread.calibration.square import Square
+from magnetosuture_thread.calibration.square import Square, TipPath
 from magnetosuture_thread.calibration.stop_checks import RESTING, TO_REST, TRIES
 from magnetosuture_thread.coils.pulses import IS_OVER, STOOD_STILL
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
 from magnetosuture_thread.geometry.needle_arc import heading_angle
 from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.nodes.coil_bridge import PROCESS
 from magnetosuture_thread.nodes.node import read_report
 from magnetosuture_thread.rig.setups import Setup
-from magnetosuture_thread.settings.configuration import to_mapping
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.configuration import Configuration, to_mapping
 from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.files import whole_folder
 from magnetosuture_thread.settings.interface import Service
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import lens_of
 
 Vector = NDArray[np.float64]
 
-BRIDGE, TRACKER = "coil_bridge", "vision_tracker"
+BRIDGE, TRACKER, MODEL = "coil_bridge", "vision_tracker", "thread_model"
 
 
 class LiveBench(clients.CoilClient):
@@ -72,7 +76,7 @@ class LiveBench(clients.CoilClient):
         self._poses: list[tuple[float, Vector]] = []  # stamp and pose
         self._texts: dict[str, tuple[str, dict[str, str]]] = {}  # state of each node, and its values
         self._before: dict[str, dict[str, Any]] = {}  # parameters of nodes that were changed
-        kinds = clients.services_to_restart(BRIDGE, TRACKER)
+        kinds = clients.services_to_restart(BRIDGE, TRACKER, MODEL)
         self._calls = clients.Services(self.node, {**kinds, Service.PULSE: Service.PULSE.type_name})
         self._measured = clients.Inbox(self.node, topics.NEEDLE_POSE, 1000)
         self._given = clients.Inbox(self.node, topics.CURRENTS, 1000)
@@ -102,24 +106,27 @@ class LiveBench(clients.CoilClient):
     def follow_square(self, coils: CoilBridgeSettings) -> tuple[float, str]:
         """Steer the needle's tip slowly around a square; see `Bench`. After it the bridge gives no pulses."""
         square = Square(coils, self._setup.scene.dish.radius)
-        believed = to_mapping(self._setup.coils)
-        values = {name: value for name, value in to_mapping(square.settings).items() if value != believed[name]}
-        self._restart(BRIDGE, {**values, "commissioning": False})
+        self._restart(BRIDGE, {**_changes(self._setup.coils, square.settings), "commissioning": False})
+        return self._steer(square)
+
+    def _steer(self, path: TipPath, each: Callable[[], None] = lambda: None) -> tuple[float, str]:
+        """Steer the needle's tip along a path, armed; return `TipPath.result`. `each` is called all the time."""
         self._await_pose(self._now())
-        fault, last, end = "", self._now(), time.monotonic() + square.time_limit
+        fault, last, end = "", self._now(), time.monotonic() + path.time_limit
         try:
             self.execute("arm")
-            while not (square.done or fault or time.monotonic() > end):
+            while not (path.done or fault or time.monotonic() > end):
                 self.turn()
+                each()
                 for stamp, pose in [entry for entry in self._poses[-8:] if entry[0] > last]:
                     last = stamp
-                    velocity = square.command(stamp, pose, self._now() - stamp)
+                    velocity = path.command(stamp, pose, self._now() - stamp)
                     self._commands.publish(packed_twist(self.node.get_clock().now().to_msg(), velocity))
                 if self._state.poll() and self._state.value.state == CoilBridgeState.STATE_FAULT:
                     fault = "; ".join(self._state.value.reasons)
         finally:
             self.execute("disarm")
-        return square.result(fault)
+        return path.result(fault)
 
     def disturbed_pulse(
         self, currents: Vector, seconds: float, after: float, disturbance: Any, hold: float
@@ -181,12 +188,7 @@ class LiveBench(clients.CoilClient):
         if not commissioning:
             name, expected = f"{BRIDGE}.commissioning", "true: start the bridge by -p coil_bridge:commissioning:=true"
             raise ConfigurationError(name, False, expected)
-        if state.state == CoilBridgeState.STATE_FAULT:
-            raise GraphError(f"coil_bridge: {'; '.join(state.reasons)}")
-        if state.state == CoilBridgeState.STATE_INACTIVE:  # as after a fault in a run before
-            self._change(BRIDGE, Transition.TRANSITION_ACTIVATE)
-        self._await_driver()
-        self.callback(self._leave)
+        self._make_ready(state)
         self.needle_length = self._measure_needle()
         for node in (BRIDGE, TRACKER):
             share = float(self._parameters(node, "needle_length")[0]) / self.needle_length
@@ -194,6 +196,19 @@ class LiveBench(clients.CoilClient):
                 self._restart(node, {"needle_length": self.needle_length})
         self._await_pose(self._now())
         self.execute("arm")
+
+    def _make_ready(self, state: CoilBridgeState) -> None:
+        """Let the bridge be ready to be armed, in a state that it reports.
+
+        Raises:
+            GraphError: something is latched.
+        """
+        if state.state == CoilBridgeState.STATE_FAULT:
+            raise GraphError(f"coil_bridge: {'; '.join(state.reasons)}")
+        if state.state == CoilBridgeState.STATE_INACTIVE:  # as after a fault in a run before
+            self._change(BRIDGE, Transition.TRANSITION_ACTIVATE)
+        self._await_driver()
+        self.callback(self._leave)
 
     def _leave(self) -> None:
         """Disarm, and let the nodes be as they were."""
@@ -323,6 +338,8 @@ class LiveBench(clients.CoilClient):
 
     def _restart(self, node: str, values: Mapping[str, Any]) -> None:
         """Give a node other parameters, by its lifecycle."""
+        if not values:
+            return
         before = dict(zip(values, self._parameters(node, *values), strict=True))
         self._before[node] = before | self._before.get(node, {})
         self._set(node, values)
@@ -357,6 +374,53 @@ class LiveBench(clients.CoilClient):
         if not success:
             self.wait(0.2)  # for the reason, on /diagnostics
             raise GraphError(f"{node}: {self._report(node)[0]}")
+
+
+class LiveThreadBench(LiveBench):
+    """See `ThreadBench`: a rig that runs with the setup of its commissioning, a thread at the needle, in an empty dish.
+
+    Raises:
+        ConfigurationError: the scene of the rig is not the setup's.
+        GraphError: bridge, tracker or thread model are not there, or something stops the coils.
+    """
+
+    def follow(self, path: TipPath, setup: Setup, bag: Path) -> tuple[float, str]:
+        """Steer the tip along a path with a setup, and record it; see `ThreadBench`."""
+        self._restart(BRIDGE, _changes(self._setup.coils, setup.coils))
+        self._restart(MODEL, _changes(self._setup.model, setup.model))
+        topic_names = topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.CURRENTS
+        inboxes = [clients.Inbox(self.node, topic, 1000) for topic in topic_names]
+        notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8")}
+        with whole_folder(bag) as folder, BagWriter(folder, notes, name=bag.name) as writer:
+            for channel in (interface.SCENE, *(inbox.topic.channel for inbox in inboxes)):
+                writer.add_topic(channel.recorded, channel.type_name)
+            now = self.node.get_clock().now().nanoseconds
+            writer.write(interface.SCENE.recorded, now, packed_scene(now, setup.scene))
+
+            def keep() -> None:
+                for inbox in inboxes:
+                    for data, arrived in inbox.take():
+                        writer.write(inbox.topic.channel.recorded, arrived, data)
+
+            try:
+                return self._steer(path, keep)
+            finally:
+                for inbox in inboxes:
+                    inbox.close()
+
+    def _begin(self) -> None:
+        self.wait(clients.DISCOVERY_TIME)
+        self._make_ready(self._wait_for_state())
+        found, version = self._state.value.scene_version, self._setup.scene.version
+        if found != version:
+            raise ConfigurationError("scene of the rig", found, f"{version}, the setup's dish without shapes")
+        self.needle_length = self._setup.coils.needle_length
+
+
+def _changes(before: Configuration, after: Configuration) -> dict[str, Any]:
+    """Return the parameters of a node that differ, as they are after."""
+    believed = to_mapping(before)
+    return {name: value for name, value in to_mapping(after).items() if value != believed[name]}
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from magnetosuture_thread.bags.reading import parse_scene_message
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands import reproduce
 from magnetosuture_thread.commands import simulate as simulate_command
-from magnetosuture_thread.commands.simulate import SUMMARY_FILE, host_bare_rig, simulate
+from magnetosuture_thread.commands.simulate import SUMMARY_FILE, host_rig, simulate
 from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes.clients import Participant, Services
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
@@ -197,7 +197,7 @@ def test_under_faults_the_tracker_is_right_or_silent_and_boards_are_driven_by_th
 def test_a_bare_needle_waits_for_a_commissioning_that_nobody_begins(tmp_path: Path):
     path = tmp_path / "short.yaml"
     path.write_text(SHORT.replace("FAULTS", ""))
-    host_bare_rig(str(path), tmp_path / "bag", rate=0.5, duration=1.0, rig="random:1")
+    host_rig(str(path), tmp_path / "bag", rate=0.5, duration=1.0, rig="random:1")
     bag = Bag(tmp_path / "bag")
     states = [record.decode() for record in bag.records({"/coils/state"})]
     assert "no pulse" in states[-1].reasons

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,16 @@ import numpy as np
 import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.calibration.square import TipPath
 from magnetosuture_thread.cli import main
+from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.nodes import clients, live_bench, topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.nodes.live_bench import LiveBench
+from magnetosuture_thread.nodes.live_bench import LiveBench, LiveThreadBench
 from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.rig.setups import Setup, read_setup
+from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.errors import ConfigurationError, GraphError, InvalidInputError
 from magnetosuture_thread.settings.interface import Service
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -220,3 +225,44 @@ def test_the_command_refuses_by_name_where_nothing_runs(
     assert "no coil_bridge state received on this ROS domain" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["commission", "petri_35mm_polyamide", "--rig", "random:1", *options])
+
+
+class FirstStretch(TipPath):
+    """A path that is done after some poses, at each of which the needle rests."""
+
+    poses = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether so many have come."""
+        return self.poses >= 40
+
+    def command(self, stamp: float, pose: np.ndarray, age: float) -> np.ndarray:
+        """Count the pose."""
+        self.poses += 1
+        return 0.0 * super().command(stamp, pose, age)
+
+
+def test_a_path_is_followed_with_the_values_of_a_setup_and_recorded(
+    graph: Any, setup: Setup, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    monkeypatch.setattr(live_bench, "PATIENCE", 30.0)  # s; of a busy machine
+    alone = {"commissioning": False, "without_prediction": "slow", "speed_without_prediction": 2e-3}
+    bridge = graph.add(CoilBridgeNode, **{**BRIDGE, **alone})
+    graph.add(FakeTracker)
+    before = bridge.configured_settings.max_pull
+    other = replace(setup, coils=replace(setup.coils, max_pull=3.0 * setup.coils.max_pull)).with_scene(setup.scene)
+    path = FirstStretch(7e-3, np.array([[6e-3, 0.0], [8e-3, 0.0]]))
+    with LiveThreadBench(setup, lambda: None) as bench:
+        bench.follow(path, other, tmp_path / "bag")
+        assert path.done
+        assert bridge.configured_settings.max_pull == other.coils.max_pull
+        assert not bridge.system.latch.armed
+    assert bridge.configured_settings.max_pull == before
+    counts = Bag(tmp_path / "bag").counts
+    assert counts[interface.NEEDLE_POSE.recorded] >= 40
+    assert counts[interface.CURRENTS.recorded] > 10
+    assert counts[interface.SCENE.recorded] == 1
+    with pytest.raises(ConfigurationError, match=r"scene of the rig: got .* the setup's dish without shapes"):
+        LiveThreadBench(setup.with_scene(Scene(Dish(0.05))), lambda: None)
