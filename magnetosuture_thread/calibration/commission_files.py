@@ -18,7 +18,14 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.reading import read_pose, stamp_of
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.calibration.commission import SQUARE_ERROR, Bench, Commissioned
-from magnetosuture_thread.calibration.pulse_model import DELAY_UNIT, LIGHT_UNIT, RESIDUAL_UNIT, Pulse, RigParameters
+from magnetosuture_thread.calibration.pulse_model import (
+    DELAY_UNIT,
+    KINDS,
+    LIGHT_UNIT,
+    RESIDUAL_UNIT,
+    Pulse,
+    RigParameters,
+)
 from magnetosuture_thread.calibration.stop_checks import StopBench, check_stops
 from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.field import CoilProperties
@@ -226,7 +233,9 @@ def values_of(result: Commissioned, believed: CoilBridgeSettings) -> list[Value]
         interval = RESIDUAL_UNIT * wide[f"residual {axis}"]
         values.append(Value(f"residual field {axis}", "T", residual, interval, MEASURED, nothing))
     for axis, light in zip("xy", rig.light.tolist(), strict=True):
-        values.append(Value(f"light {axis}", "m", light, LIGHT_UNIT * wide[f"light {axis}"], MEASURED, nothing))
+        share = wide[f"light {axis}"]
+        kind = ASSUMED if share > 0.5 * 1.96 * KINDS["light x"][0] else MEASURED  # else little more than was assumed
+        values.append(Value(f"light {axis}", "m", light, LIGHT_UNIT * share, kind, nothing))
     mean = math.exp(np.log(np.abs(rig.fields)).mean())
     values.append(Value("mean field_per_current", "T/A", mean, nothing, GAUGE, mean))
     values.append(Value("needle_moment", "A m^2", rig.moment, nothing, GAUGE, needle.moment))

@@ -175,7 +175,12 @@ class RigParameters:
     light: Vector
 
     def poses(self, pulse: Pulse, start: Vector) -> Vector:
-        """Return the poses that frames of a pulse are predicted to show, from the first one on, shape (k, 3)."""
+        """Return the poses that frames of a pulse are predicted to show, from the first one on, shape (k, 3).
+
+        Args:
+            pulse: of currents.
+            start: pose at the first frame, as it is and not as it shows, shape (3,).
+        """
         on, off = pulse.on + self.delay, pulse.off + self.delay
         poses = pulse_motion(self._coils, self._needle, self.residual, pulse.currents, on, off, pulse.times, start)
         poses[:, 2] += (self.light[1] * np.cos(poses[:, 2]) - self.light[0] * np.sin(poses[:, 2])) / self.length

@@ -37,7 +37,7 @@ class SimulatedThreadBench:
     """
 
     def __init__(self, truth: Setup, *, drawn: bool = False, seed: int = 0) -> None:
-        self._rig, self._drawn, self._seed = truth.rig, drawn, seed
+        self._rig, self._drawn, self._seed = replace(truth.rig, obstacle_looks=()), drawn, seed
 
     def follow(self, path: TipPath, setup: Setup, bag: Path) -> tuple[float, str]:
         """Steer the tip along a path with a setup, and record it; see `ThreadBench`."""

@@ -36,7 +36,8 @@ WHOLE = 0.99  # of the thread's length, which has to be seen: an end that comes 
 TURN_RATE = 0.4  # rad/s; a needle that turns faster is on no straight pull
 WALL_CLEARANCE = 4e-4  # m; of all of the thread: the wall's force upon it is not measured
 LEAST_PULL = 0.5  # s
-LEAST_PULLS = 3  # by whose scatter the interval is
+LEAST_PULLS = 4  # by whose scatter the interval is
+LENGTH_ERROR = 0.02  # of the thread's length: by more, what is taken for its whole is not
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +45,12 @@ class Pulls:
     """What was measured in straight pulls.
 
     Attributes:
-        times: of the frames, shape (k,) [s].
         force: of the coils upon the needle, along it, shape (k,) [N].
         speed: v, shape (k,) [m/s].
         thread: A and N, shape (k, 2) [m/s].
         index: of the pull that each frame is of, shape (k,).
     """
 
-    times: Vector
     force: Vector
     speed: Vector
     thread: Vector
@@ -89,6 +88,7 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
     """
     length = setup.model.thread_length
     given, poses, threads = list[list[float]](), dict[float, Vector](), dict[float, Points]()
+    lengths = list[float]()
     channels = interface.CURRENTS, interface.NEEDLE_POSE, interface.MEASURED_THREAD
     for record in Bag(path).records({channel.recorded for channel in channels}):
         stamp = 1e-9 * stamp_of(record)
@@ -96,8 +96,15 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
             given.append([stamp, *record.decode().current])
         elif record.topic == interface.NEEDLE_POSE.recorded:
             poses[stamp] = np.concatenate(read_pose(record)[:2])
-        elif len(curve := read_path(record)) > 1 and (seen := arc_lengths(curve)[-1]) > WHOLE * length:
-            threads[stamp] = points_at(curve, np.minimum(seen, np.linspace(0.0, length, POINTS + 1)))
+        elif len(curve := read_path(record)) > 1:
+            lengths.append(seen := float(arc_lengths(curve)[-1]))
+            if seen > WHOLE * length:
+                threads[stamp] = points_at(curve, np.minimum(seen, np.linspace(0.0, length, POINTS + 1)))
+    # A hand or glare hides a part of it in some frames; nothing makes it longer.
+    if lengths and abs((seen := float(np.quantile(lengths, 0.9))) / length - 1.0) > LENGTH_ERROR:
+        raise BagError(
+            path, f"shows a thread of {1e3 * seen:.1f} mm; thread_length is {1e3 * length:.1f} mm: measure it"
+        )
     times = np.array(sorted(poses.keys() & threads.keys()))
     if len(given) < 2 or len(times) < 20:
         raise BagError(path, f"has {len(given)} currents, and {len(times)} frames with needle and whole thread")
@@ -124,7 +131,7 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
     chosen = np.concatenate(kept)
     force = _force(np.array(given), times[chosen], pose[chosen, :2], e[chosen], setup)
     index = np.repeat(np.arange(len(kept)), [len(run) for run in kept])
-    return Pulls(times[chosen], force, speed[chosen], thread[chosen], index)
+    return Pulls(force, speed[chosen], thread[chosen], index)
 
 
 def _slopes(values: Vector, times: Vector, w: int) -> Vector:
@@ -169,8 +176,9 @@ def measure_drag(pulls: Pulls, own: tuple[float, float]) -> ThreadDrag:
     drags, spread, inverse = _fit(pulls.thread, pulls.force - value * pulls.speed, pulls.index)
     by_own = inverse @ pulls.thread.T @ pulls.speed  # - d drag / d D
     wide = np.sqrt(spread**2 + (interval * by_own) ** 2 + (interval / value * drags) ** 2)
-    # Of the sum, an error of D counts by what T does not take up.
-    total = float(np.sqrt(spread[0] ** 2 + (interval * (1.0 - by_own[0])) ** 2 + (interval / value * drags[0]) ** 2))
+    # Of the sum, an error of D by itself counts by what T does not take up, and one of all coils by the same share.
+    shares = interval * (1.0 - by_own[0]), interval / value * (value + drags[0])
+    total = float(np.sqrt(spread[0] ** 2 + shares[0] ** 2 + shares[1] ** 2))
     all_three = np.column_stack([pulls.thread, pulls.speed])
     own_by_pulls = float(_fit(all_three, pulls.force, pulls.index)[0][2])
     along, across = zip(drags.tolist(), wide.tolist(), strict=True)
@@ -185,7 +193,7 @@ def _fit(rows: Vector, values: Vector, index: Indices) -> tuple[Vector, Vector, 
     left, count = values - rows @ found, int(index[-1]) + 1
     scores = np.array([rows[index == k].T @ left[index == k] for k in range(count)])
     variance = np.diag(inverse @ scores.T @ scores @ inverse) * count / (count - 1.0)
-    return found, stdtrit(count - 1, 0.975) * np.sqrt(variance), inverse
+    return found, stdtrit(max(1, count - rows.shape[1]), 0.975) * np.sqrt(variance), inverse
 
 
 def lines_of(pulls: Pulls, drag: ThreadDrag, own: float) -> Sequence[tuple[float, float]]:

@@ -29,14 +29,14 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.settings.configuration import read_yaml
-from magnetosuture_thread.settings.errors import BagError, ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.settings.files import whole_file
 from magnetosuture_thread.settings.shared_parameters import EVERY_NODE, PARAMETERS
 
-THREAD_FILE, PAGE_FILE, RUNS = "thread.yaml", "thread.pdf", "thread"
+THREAD_FILE, PAGE_FILE, REFUSED_FILE, RUNS = "thread.yaml", "thread.pdf", "thread_refused.pdf", "thread"
 BARE_DRAG = "needle_drag without thread"  # in the summary of a commissioning
 PULLS, OTHER_PULLS = 5, 3  # of the run that is fitted, and of the one that is predicted
-# Of the prediction, mean and maximum over time [% of length]: of 19 mm the mean is 0.4 mm, less than keep_out.
+# Of the prediction, mean and maximum over time [% of length]; the mean is less than keep_out, too.
 MEAN_ERROR, WORST_ERROR = 2.0, 5.0
 NOISE = 0.1  # % of length, as in the fit; by more a prediction may not be worse than with what was assumed before
 DRAG_INTERVAL = 0.25  # of thread_drag, as of all that commission calls measured
@@ -120,7 +120,7 @@ class ThreadCommissioning:
         with TemporaryDirectory() as spare:
             try:
                 failures = self._measure(Path(spare)) or self._verify(Path(spare))
-            except BagError as error:
+            except MagnetosutureError as error:
                 failures = [str(error)]
         return replace(self._result, failures=tuple(failures), bags=self._bags)
 
@@ -131,6 +131,8 @@ class ThreadCommissioning:
             return [f"fitted: {problem}"]
         path, selection = self._folder / self._bags["fitted"], {"source": "poses", "setup_name": str(self.setup.path)}
         fit = calibrate_bags([path], spare / THREAD_FILE, log=self._log, **selection)  # type: ignore[arg-type]
+        if not fit.finished:  # `calibrate` keeps what it has when it is interrupted
+            raise KeyboardInterrupt
         self._result = ThreadResult(fit=fit)
         measured = read_pulls(path, self.setup)
         drag = measure_drag(measured, self._own)
@@ -149,7 +151,7 @@ class ThreadCommissioning:
         self._result = replace(self._result, prediction=prediction, square=apart)
         if not problem and apart > SQUARE_ERROR:
             problem = f"the needle is {1e3 * apart:.2f} mm off ({1e3 * SQUARE_ERROR:g} mm allowed)"
-        failures = prediction_failures(prediction) + ([f"square: {problem}"] if problem else [])
+        failures = prediction_failures(prediction, after) + ([f"square: {problem}"] if problem else [])
         if not failures:
             text, run = (spare / THREAD_FILE).read_text(encoding="utf-8"), self._bags["fitted"]
             with whole_file(self._folder / THREAD_FILE) as partial:
@@ -162,7 +164,8 @@ class ThreadCommissioning:
         """Follow a path into the next bag of the folder; bags of before stay."""
         runs = self._folder / RUNS
         runs.mkdir(exist_ok=True)
-        self._bags[name] = f"{RUNS}/{len([*runs.iterdir()]):03d}"
+        last = max((int(run.name) for run in runs.iterdir() if run.name.isdigit()), default=-1)
+        self._bags[name] = f"{RUNS}/{last + 1:03d}"
         apart, problem = self._bench.follow(path, setup, self._folder / self._bags[name])
         self._log(f"{name}: {problem or f'within {1e3 * apart:.2f} mm of the path'}; {self._bags[name]}")
         return apart, problem
@@ -211,7 +214,10 @@ def read_commissioned(folder: Path) -> tuple[Setup, tuple[float, float]]:
     if summary.get("verdict") != "pass":
         raise ConfigurationError("verdict", summary.get("verdict"), "pass: commission the bare needle first", str(path))
     own = next(value for value in summary["values"] if value["name"] == BARE_DRAG)
-    setup = read_setup(str(folder / files.SETUP_FILE))
+    setup, coils = read_setup(str(folder / files.SETUP_FILE)), str((folder / files.COILS_FILE).resolve())
+    if setup.coils.calibration not in ("", coils):
+        name = f"{CoilBridgeSettings.GROUP}.calibration"
+        raise ConfigurationError(name, setup.coils.calibration, f"{coils}, of the same folder", str(setup.path))
     return setup.with_scene(Scene(setup.scene.dish)), (own["value"], own["interval"])
 
 
@@ -242,12 +248,11 @@ def drag_failures(drag: ThreadDrag, bare: float) -> list[str]:
     return [words for failed, words in checks if failed]
 
 
-def prediction_failures(prediction: Prediction) -> list[str]:
-    """Return why a prediction is none that a needle may be planned by."""
+def prediction_failures(prediction: Prediction, setup: Setup) -> list[str]:
+    """Return why a prediction is none that a needle may be planned by with a setup."""
     errors = prediction.after["seen"]
-    if errors is None:
-        return ["predicted: the thread was not measured"]
-    figures = (("mean", errors["mean"], MEAN_ERROR), ("maximum", errors["maximum"], WORST_ERROR))
+    room = 100.0 * setup.coils.keep_out / setup.model.thread_length
+    figures = (("mean", errors["mean"], min(MEAN_ERROR, room)), ("maximum", errors["maximum"], WORST_ERROR))
     before = prediction.before["seen"]["mean"]
     worse = f"predicted: the mean error is {errors['mean']:.2f} %, and {before:.2f} % as assumed before"
     return ([worse] if errors["mean"] > before + NOISE else []) + [
@@ -258,7 +263,7 @@ def prediction_failures(prediction: Prediction) -> list[str]:
 
 
 def write_thread(folder: Path, result: ThreadResult, setup: Setup, date: str) -> dict[str, Any]:
-    """Write the page, and what was found into the summary, which is the last; return the part of the thread.
+    """Write the page, and what was found into the summary, which is the last; return that and the page's name.
 
     Args:
         folder: of the commissioning.
@@ -271,6 +276,9 @@ def write_thread(folder: Path, result: ThreadResult, setup: Setup, date: str) ->
     path = folder / files.SUMMARY_FILE
     summary = json.loads(path.read_text(encoding="utf-8"))
     part: dict[str, Any] = {"verdict": "refused" if result.failures else "pass", "failures": list(result.failures)}
+    # What the setup has from a run that passed stays beside one that did not.
+    kept = bool(result.failures) and summary.get("thread", {}).get("verdict") == "pass"
+    page, key = (REFUSED_FILE, "thread_refused") if kept else (PAGE_FILE, "thread")
     part |= {name: summary[name] for name in ("setup", "poses", "rig")}
     part |= {"date": date, "bags": dict(result.bags), "values": [plain_values(value) for value in result.values]}
     limits = {"mean_error_percent": MEAN_ERROR, "worst_error_percent": WORST_ERROR, "square": SQUARE_ERROR}
@@ -283,11 +291,11 @@ def write_thread(folder: Path, result: ThreadResult, setup: Setup, date: str) ->
         part["prediction"] = {"before": result.prediction.before, "after": result.prediction.after}
     if math.isfinite(result.square):
         part["square"] = result.square
-    with whole_file(folder / PAGE_FILE) as partial:
+    with whole_file(folder / page) as partial:
         partial.write_bytes(draw_thread(result, setup, part))
     found = {value.name: plain_values(value) | {"changed": value.changed} for value in result.values}
     if not result.failures:
         summary["values"] = [found.get(value["name"], value) for value in summary["values"]]
     with whole_file(path) as partial:
-        partial.write_text(json.dumps(summary | {"thread": part}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return part
+        partial.write_text(json.dumps(summary | {key: part}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return part | {"page": page}

@@ -19,7 +19,6 @@ from magnetosuture_thread.calibration.commission import Commissioning
 from magnetosuture_thread.calibration.simulated_bench import SimulatedBench
 from magnetosuture_thread.calibration.simulated_thread import SimulatedThreadBench
 from magnetosuture_thread.calibration.thread_step import (
-    PAGE_FILE,
     ThreadBench,
     ThreadCommissioning,
     read_commissioned,
@@ -163,7 +162,8 @@ def run_commission_thread(options: argparse.Namespace, terminal: command.Termina
       thread.yaml    the thread's parameters, for thread_model, and
       setup.yaml     is changed by them, thread_drag, needle_drag and max_pull: both only if the verification passed
       summary.json   in it, verdict, limits and values of the thread with their intervals
-      thread.pdf     the same on one page, with the error of the prediction
+      thread.pdf     the same on one page, with the error of the prediction; a run that is refused after one that
+                     passed has thread_refused.pdf, and thread_refused in summary.json
       thread/NNN     a bag of each run, numbered on
     """
     folder: Path = options.folder
@@ -184,7 +184,7 @@ def run_commission_thread(options: argparse.Namespace, terminal: command.Termina
     if result.prediction is not None and (errors := result.prediction.after["seen"]):
         figures = f"mean {errors['mean']:.3g}, maximum {errors['maximum']:.3g} % of the length"
         terminal.log(f"prediction of the run that was not fitted: {figures}")
-    terminal.log(f"verdict: {part['verdict']}; {folder / PAGE_FILE}")
+    terminal.log(f"verdict: {part['verdict']}; {folder / part['page']}")
     return command.FAILED if result.failures else command.DONE
 
 

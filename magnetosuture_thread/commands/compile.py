@@ -32,13 +32,16 @@ def run_compile(options: argparse.Namespace, terminal: Terminal) -> None:
     after an installation or an update.
     """
     began = time.perf_counter()
-    gc.disable()  # a tenth of the time: the compiler makes millions of objects, and few in circles
     steps = kernel_steps()
-    for number, (name, load) in enumerate(steps.items(), 1):
-        started, before = time.perf_counter(), compilations()
-        load()
-        what = "compiled" if compilations() > before else "cached"
-        terminal.print(f"{number} of {len(steps)}  {name}: {what}, {time.perf_counter() - started:.0f} s")
+    gc.disable()  # a tenth of the time: the compiler makes millions of objects, and few in circles
+    try:
+        for number, (name, load) in enumerate(steps.items(), 1):
+            started, before = time.perf_counter(), compilations()
+            load()
+            what = "compiled" if compilations() > before else "cached"
+            terminal.print(f"{number} of {len(steps)}  {name}: {what}, {time.perf_counter() - started:.0f} s")
+    finally:
+        gc.enable()
     terminal.print(f"all functions are compiled, {time.perf_counter() - began:.0f} s")
 
 

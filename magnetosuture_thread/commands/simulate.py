@@ -209,9 +209,8 @@ def host_rig(
     """
     believed = read_setup(setup_name)
     setup = with_rig(believed, rig).with_scene(Scene(believed.scene.dish))
-    if not threaded:
-        bare = bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))
-        setup = replace(setup, rig=bare).with_scene(setup.scene)
+    rig_of = setup.rig if threaded else bare_rig(setup.rig, np.random.default_rng(setup.rig.seed))
+    setup = replace(setup, rig=replace(rig_of, obstacle_looks=())).with_scene(setup.scene)
     _Run(setup, believed.rig, _Waiting(gives_pulses=not threaded), duration, rate, boards, log, progress).write(output)
 
 

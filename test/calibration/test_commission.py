@@ -50,6 +50,7 @@ def true_values(rig: RigSettings, believed: Setup, length: float) -> dict[str, f
     share = moment * nominal / (body.pole * rig.needle_length * mean)
     names = ("needle_drag without thread", "needle_drag_across", "needle_turning_drag")
     values = dict(zip(names, (share * np.array(body.drag)).tolist(), strict=True))
+    values |= {"light x": 0.0, "light y": 0.0}  # where poses are drawn
     values |= {"needle_length": rig.needle_length, "motion_delay": rig.current_delay + rig.stamp_delay}
     for axis, residual in zip("xy", rig.residual_field, strict=True):
         values[f"residual field {axis}"] = way * residual * nominal / mean

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from magnetosuture_thread.calibration.thread_step import (
 )
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands.evaluate import evaluate_bags
+from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.rig.dynamics import NeedleBody
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.rig.setups import Setup, read_setup
@@ -45,7 +47,7 @@ def some_pulls(own: float = OWN, strength: float = 1.0, noise: float = 2e-7) -> 
     speed = 2e-3 * (1.0 + 0.1 * random.standard_normal(count * each))
     thread = speed[:, None] * random.uniform(-1.0, 1.0, (count, 2))[index]
     force = (own * speed + thread @ [ALONG, ACROSS]) / strength + noise * random.standard_normal(count)[index]
-    return Pulls(np.arange(count * each) / 60.0, force, speed, thread, index)
+    return Pulls(force, speed, thread, index)
 
 
 def test_the_balance_of_forces_tells_the_drags_of_a_thread_in_any_shape():
@@ -65,6 +67,11 @@ def test_what_all_coils_are_wrong_by_is_within_the_interval():
     drag = measure_drag(some_pulls(strength=1.05), (OWN / 1.05, 0.05 * OWN))  # as the bare needle's drag shows it
     assert abs(drag.along[0] - ALONG) < drag.along[1]
     assert drag.along[1] > 0.05 * ALONG
+    pulls = some_pulls(strength=1.05)
+    pulls.thread[:, 0] = pulls.speed * np.linspace(0.5, 0.95, 8)[pulls.index]  # nearly straight behind the needle
+    force = (OWN * pulls.speed + pulls.thread @ [ALONG, ACROSS]) / 1.05
+    total = measure_drag(replace(pulls, force=force), (OWN / 1.05, 0.05 * OWN)).total
+    assert abs(total[0] - OWN - ALONG) < total[1]
 
 
 def test_another_needle_and_a_drag_that_is_hardly_known_are_refused():
@@ -116,6 +123,37 @@ def test_a_needle_that_does_not_follow_gives_a_page_and_no_setup(tmp_path: Path)
     assert (tmp_path / "thread.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "setup.yaml").read_bytes() == before
     assert not (tmp_path / "thread.yaml").exists()
+
+
+def test_a_run_that_is_refused_after_one_that_passed_leaves_what_that_found(tmp_path: Path):
+    write_commissioned(tmp_path, "pass")
+    path = tmp_path / "summary.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"thread": {"verdict": "pass", "values": [1]}}))
+    result = ThreadCommissioning(tmp_path, StuckBench(), lambda line: None).run()
+    part = write_thread(tmp_path, result, read_commissioned(tmp_path)[0], "2026-01-01")
+    summary = json.loads(path.read_text())
+    assert summary["thread"] == {"verdict": "pass", "values": [1]}
+    assert summary["thread_refused"]["failures"] == ["fitted: needle does not follow"]
+    assert part["page"] == "thread_refused.pdf"
+    assert not (tmp_path / "thread.pdf").exists()
+
+
+@pytest.mark.parametrize("name", ["hernia_ring", "petri_35mm_polyamide_post", "petri_150mm_silk"])
+def test_a_thread_is_driven_in_the_empty_dish_of_every_setup(name: str, tmp_path: Path):
+    setup = read_setup(name)
+    empty = setup.with_scene(Scene(setup.scene.dish))
+
+    class Ended(TipPath):
+        """A path that is over at its first pose."""
+
+        @property
+        def done(self) -> bool:
+            """Whether there was one."""
+            return bool(self._tips)
+
+    path = Ended(setup.coils.needle_length, np.array([[1e-3, 0.0], [2e-3, 0.0]]))
+    SimulatedThreadBench(setup, drawn=True).follow(path, empty, tmp_path / "run")
+    assert Bag(tmp_path / "run").damage is None
 
 
 def test_a_commissioning_that_was_refused_has_no_thread(tmp_path: Path):
