@@ -1,7 +1,7 @@
 """Finds the petri dish, how far the camera over it is tilted, and whether it moves.
 
 Candidates are the rings of a dish, the edges of its wall and its lid: ellipses that edges of the image agree on in most
-directions. A wall as dark as steel, on both sides of which the ground is seen, tells the inner edge to 0.1 %. Of any
+directions. A wall as dark as steel, on both sides of which the ground is seen, tells the inner edge to 0.35 px. Of any
 other the innermost ring is taken, and by how much the others differ from it is the doubt of the scale. A tilt is one
 that two rings agree on.
 """
@@ -38,7 +38,8 @@ TILT_ERROR = math.radians(2.0)  # of a ring's tilt, by light and noise
 CUT_TILT = math.radians(10.0)  # that a dish of which a part is seen does not tell
 
 DARK_FLOOR = 130.0  # grey levels; a dish, or with a given view a frame, whose median is below may have a dark floor
-SCALE_ERROR = 0.001  # of a scale by a dark wall: how far its light moves the edge
+# Of a radius by a dark wall: how far its light moves the edge at least, and in pixels, as in blurred rendered frames.
+SCALE_ERROR, EDGE_ERROR_PX = 0.001, 0.35
 RING_ERROR = 0.01  # of a radius and a centre by a ring of any other look; with the tolerances of a mould three times it
 
 NO_DISH = "no dish in the image: show its whole rim in even light, limit the search by region_px, or give its view"
@@ -543,9 +544,10 @@ def _by_wall(
     is_alone = min(shares) > 1.0 - 2.0 * AGREEMENT and max(shares) < farthest
     if not (is_dark and is_alone and higher > max(MIN_CONTRAST, 0.15 * max(floor, wall))):
         return None
-    error = RING_ERROR if len(spread) < needed else SCALE_ERROR
+    by_edge = max(SCALE_ERROR, EDGE_ERROR_PX / radius)
+    error = RING_ERROR if len(spread) < needed else by_edge
     if ring is not None and ring[3] >= needed:
-        view, error = replace(view, centre_px=ring[:2]), SCALE_ERROR
+        view, error = replace(view, centre_px=ring[:2]), by_edge
     if ring is not None and seen.mean() < 0.9:
         # By an edge that light shifts, a part of a circle tells its centre and its radius apart badly.
         scale = 0.5 * diameter / middle(np.hypot(*(edges - ring[:2]).T))

@@ -8,7 +8,7 @@ import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
-from magnetosuture_thread.vision.dish import SCALE_ERROR, DishWatch, see_dish
+from magnetosuture_thread.vision.dish import EDGE_ERROR_PX, DishWatch, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.shared import known
 from test.vision.scenes import NOWHERE, Pose, finger, render
@@ -26,9 +26,18 @@ def gray_of(centre: tuple[float, float], scale: float, seed: int, lighting: Ligh
 @pytest.mark.parametrize("lighting", [Lighting(), Lighting(gain=0.5, slope=4.0, noise=3.0)])
 def test_the_dish_is_found_to_a_quarter_of_a_pixel(centre, scale: float, seed: int, lighting: Lighting):
     found = known(see_dish(gray_of(centre, scale, seed, lighting), VisionTrackerSettings(), 0.035))
-    assert found.scale_error == SCALE_ERROR
+    assert found.scale_error == pytest.approx(EDGE_ERROR_PX * scale / 0.0175, rel=0.01)
     assert np.linalg.norm(np.subtract(found.view.centre_px, centre)) < 0.25
-    assert found.view.metres_per_pixel == pytest.approx(scale, rel=6e-3)
+    assert found.view.metres_per_pixel == pytest.approx(scale, rel=min(6e-3, 3.0 * found.scale_error))
+
+
+@pytest.mark.parametrize("blur", [0.75, 2.0])
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (1280, 960)])
+def test_the_scale_is_as_true_as_is_said(size: tuple[int, int], blur: float):
+    scale, centre = 0.035 / (0.91 * size[1]), (0.503 * size[0], 0.496 * size[1])
+    camera = DishCamera(CameraScene(), DishView(centre, scale), size, lighting=Lighting(blur_px=blur))
+    found = known(see_dish(camera.render(np.zeros(2), 0.3, NOWHERE)[:, :, 1].copy(), VisionTrackerSettings(), 0.035))
+    assert abs(found.view.metres_per_pixel / scale - 1.0) < 3.0 * found.scale_error
 
 
 def test_a_hand_over_a_third_of_the_rim_does_not_move_the_dish():
