@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
+import math
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,12 +15,61 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from magnetosuture_thread.calibration import commission_files as files
 from magnetosuture_thread.calibration.commission import SQUARE_ERROR
 from magnetosuture_thread.calibration.commission_report import draw_rows, draw_table
 from magnetosuture_thread.calibration.thread_drag import lines_of
-from magnetosuture_thread.calibration.thread_step import MEAN_ERROR, WORST_ERROR, Prediction, ThreadResult
+from magnetosuture_thread.calibration.thread_step import (
+    DRAG_INTERVAL,
+    MEAN_ERROR,
+    OWN_DRAG_ERROR,
+    WORST_ERROR,
+    Prediction,
+    ThreadResult,
+)
+from magnetosuture_thread.evaluation.metrics import plain_values
 from magnetosuture_thread.evaluation.plots import BAD, FAINT, GOOD, INK, PREDICTED, SEEN, draw_shapes, make_figure, tidy
 from magnetosuture_thread.rig.setups import Setup
+from magnetosuture_thread.settings.files import whole_file
+
+PAGE_FILE, REFUSED_FILE = "thread.pdf", "thread_refused.pdf"
+
+
+def write_thread(folder: Path, result: ThreadResult, setup: Setup, date: str) -> dict[str, Any]:
+    """Write the page, and what was found into the summary, which is the last; return that and the page's name.
+
+    Args:
+        folder: of the commissioning.
+        result: of the thread.
+        setup: from before.
+        date: of the page.
+    """
+    path = folder / files.SUMMARY_FILE
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    part: dict[str, Any] = {"verdict": "refused" if result.failures else "pass", "failures": list(result.failures)}
+    # What the setup has from a run that passed stays beside one that did not.
+    kept = bool(result.failures) and summary.get("thread", {}).get("verdict") == "pass"
+    page, key = (REFUSED_FILE, "thread_refused") if kept else (PAGE_FILE, "thread")
+    part |= {name: summary[name] for name in ("setup", "poses", "rig")}
+    part |= {"date": date, "bags": dict(result.bags), "values": [plain_values(value) for value in result.values]}
+    limits = {"mean_error_percent": MEAN_ERROR, "worst_error_percent": WORST_ERROR, "square": SQUARE_ERROR}
+    part["limits"] = limits | {"thread_drag_interval": DRAG_INTERVAL, "own_drag_error": OWN_DRAG_ERROR}
+    if result.fit is not None:
+        part["warnings"] = result.fit.warnings
+    if result.drag is not None:
+        part |= {"pulls": result.drag.pulls, "own_drag_by_pulls": result.drag.own}
+    if result.prediction is not None:
+        part["prediction"] = {"before": result.prediction.before, "after": result.prediction.after}
+    if math.isfinite(result.square):
+        part["square"] = result.square
+    with whole_file(folder / page) as partial:
+        partial.write_bytes(draw_thread(result, setup, part))
+    found = {value.name: plain_values(value) | {"changed": value.changed} for value in result.values}
+    if not result.failures:
+        summary["values"] = [found.get(value["name"], value) for value in summary["values"]]
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(summary | {key: part}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return part | {"page": page}
 
 
 def draw_thread(result: ThreadResult, setup: Setup, part: Mapping[str, Any]) -> bytes:

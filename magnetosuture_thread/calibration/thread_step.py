@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -21,7 +20,7 @@ from magnetosuture_thread.calibration.square import Square, TipPath, pulls
 from magnetosuture_thread.calibration.thread_drag import Pulls, ThreadDrag, measure_drag, read_pulls
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.estimator.settings import ThreadModelSettings
-from magnetosuture_thread.evaluation.metrics import RunMetrics, plain_values
+from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.recorded import Event, Step, open_bag
 from magnetosuture_thread.evaluation.replay import measure_run
 from magnetosuture_thread.evaluation.workers import Log
@@ -33,7 +32,7 @@ from magnetosuture_thread.settings.errors import ConfigurationError, Magnetosutu
 from magnetosuture_thread.settings.files import whole_file
 from magnetosuture_thread.settings.shared_parameters import EVERY_NODE, PARAMETERS
 
-THREAD_FILE, PAGE_FILE, REFUSED_FILE, RUNS = "thread.yaml", "thread.pdf", "thread_refused.pdf", "thread"
+THREAD_FILE, RUNS = "thread.yaml", "thread"
 BARE_DRAG = "needle_drag without thread"  # in the summary of a commissioning
 PULLS, OTHER_PULLS = 5, 3  # of the run that is fitted, and of the one that is predicted
 # Of the prediction, mean and maximum over time [% of length]; the mean is less than keep_out, too.
@@ -260,42 +259,3 @@ def prediction_failures(prediction: Prediction, setup: Setup) -> list[str]:
         for name, error, limit in figures
         if error > limit
     ]
-
-
-def write_thread(folder: Path, result: ThreadResult, setup: Setup, date: str) -> dict[str, Any]:
-    """Write the page, and what was found into the summary, which is the last; return that and the page's name.
-
-    Args:
-        folder: of the commissioning.
-        result: of the thread.
-        setup: from before.
-        date: of the page.
-    """
-    from magnetosuture_thread.calibration.thread_report import draw_thread  # late, as it imports matplotlib
-
-    path = folder / files.SUMMARY_FILE
-    summary = json.loads(path.read_text(encoding="utf-8"))
-    part: dict[str, Any] = {"verdict": "refused" if result.failures else "pass", "failures": list(result.failures)}
-    # What the setup has from a run that passed stays beside one that did not.
-    kept = bool(result.failures) and summary.get("thread", {}).get("verdict") == "pass"
-    page, key = (REFUSED_FILE, "thread_refused") if kept else (PAGE_FILE, "thread")
-    part |= {name: summary[name] for name in ("setup", "poses", "rig")}
-    part |= {"date": date, "bags": dict(result.bags), "values": [plain_values(value) for value in result.values]}
-    limits = {"mean_error_percent": MEAN_ERROR, "worst_error_percent": WORST_ERROR, "square": SQUARE_ERROR}
-    part["limits"] = limits | {"thread_drag_interval": DRAG_INTERVAL, "own_drag_error": OWN_DRAG_ERROR}
-    if result.fit is not None:
-        part["warnings"] = result.fit.warnings
-    if result.drag is not None:
-        part |= {"pulls": result.drag.pulls, "own_drag_by_pulls": result.drag.own}
-    if result.prediction is not None:
-        part["prediction"] = {"before": result.prediction.before, "after": result.prediction.after}
-    if math.isfinite(result.square):
-        part["square"] = result.square
-    with whole_file(folder / page) as partial:
-        partial.write_bytes(draw_thread(result, setup, part))
-    found = {value.name: plain_values(value) | {"changed": value.changed} for value in result.values}
-    if not result.failures:
-        summary["values"] = [found.get(value["name"], value) for value in summary["values"]]
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(summary | {key: part}, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return part | {"page": page}

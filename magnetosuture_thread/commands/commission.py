@@ -22,7 +22,6 @@ from magnetosuture_thread.calibration.thread_step import (
     ThreadBench,
     ThreadCommissioning,
     read_commissioned,
-    write_thread,
 )
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.evaluation.recorded import SETUP_NOTE
@@ -171,6 +170,8 @@ def run_commission_thread(options: argparse.Namespace, terminal: command.Termina
     summary = read_yaml(folder / files.SUMMARY_FILE, "summary of a commissioning")
     with _thread_bench(setup, summary, options) as bench:
         result = ThreadCommissioning(folder, bench, terminal.log).run()
+    from magnetosuture_thread.calibration.thread_report import write_thread  # late, as it imports matplotlib
+
     part = write_thread(folder, result, setup, datetime.date.today().isoformat())
     rows = [
         (value.name, *_cells(value.value, value.interval, value.before), value.unit, value.kind)

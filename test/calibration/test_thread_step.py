@@ -17,13 +17,13 @@ from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.calibration.simulated_thread import SimulatedThreadBench
 from magnetosuture_thread.calibration.square import TipPath, pulls
 from magnetosuture_thread.calibration.thread_drag import Pulls, measure_drag
+from magnetosuture_thread.calibration.thread_report import write_thread
 from magnetosuture_thread.calibration.thread_step import (
     BARE_DRAG,
     RUNS,
     ThreadCommissioning,
     drag_failures,
     read_commissioned,
-    write_thread,
 )
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.commands.evaluate import evaluate_bags
