@@ -87,13 +87,13 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
         BagError: the bag cannot be used, or has fewer than `LEAST_PULLS` pulls.
     """
     length = setup.model.thread_length
-    given, poses, threads = list[list[float]](), dict[float, Vector](), dict[float, Points]()
+    commanded, poses, threads = list[list[float]](), dict[float, Vector](), dict[float, Points]()
     lengths = list[float]()
     channels = interface.CURRENTS, interface.NEEDLE_POSE, interface.MEASURED_THREAD
     for record in Bag(path).records({channel.recorded for channel in channels}):
         stamp = 1e-9 * stamp_of(record)
         if record.topic == interface.CURRENTS.recorded:
-            given.append([stamp, *record.decode().current])
+            commanded.append([stamp, *record.decode().current])
         elif record.topic == interface.NEEDLE_POSE.recorded:
             poses[stamp] = np.concatenate(read_pose(record)[:2])
         elif len(curve := read_path(record)) > 1:
@@ -106,8 +106,8 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
             path, f"shows a thread of {1e3 * seen:.1f} mm; thread_length is {1e3 * length:.1f} mm: measure it"
         )
     times = np.array(sorted(poses.keys() & threads.keys()))
-    if len(given) < 2 or len(times) < 20:
-        raise BagError(path, f"has {len(given)} currents, and {len(times)} frames with needle and whole thread")
+    if len(commanded) < 2 or len(times) < 20:
+        raise BagError(path, f"has {len(commanded)} currents, and {len(times)} frames with needle and whole thread")
     pose, nodes = np.array([poses[t] for t in times]), np.array([threads[t] for t in times])
     w = max(1, round(HALF_WINDOW / float(np.median(np.diff(times)))))
     span, inside = times[2 * w :] - times[: -2 * w], slice(w, -w)
@@ -129,7 +129,7 @@ def read_pulls(path: Path, setup: Setup) -> Pulls:
     if len(kept) < LEAST_PULLS:
         raise BagError(path, f"has {len(kept)} straight pulls with the thread off the wall, of {LEAST_PULLS} at least")
     chosen = np.concatenate(kept)
-    force = _force(np.array(given), times[chosen], pose[chosen, :2], e[chosen], setup)
+    force = _force(np.array(commanded), times[chosen], pose[chosen, :2], e[chosen], setup)
     index = np.repeat(np.arange(len(kept)), [len(run) for run in kept])
     return Pulls(force, speed[chosen], thread[chosen], index)
 
@@ -143,20 +143,22 @@ def _slopes(values: Vector, times: Vector, w: int) -> Vector:
     return np.asarray(sum(np.einsum("k,k...->k...", numbers[k], values[k : k + count]) for k in range(2 * w + 1)))
 
 
-def _force(given: Vector, times: Vector, tails: Points, e: Points, setup: Setup) -> Vector:
+def _force(commanded: Vector, times: Vector, tails: Points, e: Points, setup: Setup) -> Vector:
     """Return the force of the coils upon the needle along it, by the mean currents around each time, shape (k,) [N].
 
     Args:
-        given: stamps and currents, shape (j, 1 + m) [s, A].
+        commanded: stamps and currents, shape (j, 1 + m) [s, A].
         times: of frames; what they show was commanded `motion_delay` before, shape (k,) [s].
         tails: of the needle, shape (k, 2) [m].
         e: its direction, shape (k, 2).
         setup: with the coils.
     """
     needle, field = setup.coils.needle(), setup.coils.coil_field()
-    steps = np.diff(given[:, 0])[:, None] * 0.5 * (given[1:, 1:] + given[:-1, 1:])
+    steps = np.diff(commanded[:, 0])[:, None] * 0.5 * (commanded[1:, 1:] + commanded[:-1, 1:])
     charge, at = np.vstack([np.zeros(steps.shape[1]), np.cumsum(steps, axis=0)]), times - setup.coils.motion_delay
-    ends = [[np.interp(at + side * HALF_WINDOW, given[:, 0], column) for column in charge.T] for side in (-1.0, 1.0)]
+    ends = [
+        [np.interp(at + side * HALF_WINDOW, commanded[:, 0], column) for column in charge.T] for side in (-1.0, 1.0)
+    ]
     currents = (np.array(ends[1]) - np.array(ends[0])).T / (2.0 * HALF_WINDOW)
     gradients = [field.per_current(t + needle.length * d) - field.per_current(t) for t, d in zip(tails, e, strict=True)]
     return np.asarray(needle.pole * np.einsum("kim,km,ki->k", np.array(gradients), currents, e))
