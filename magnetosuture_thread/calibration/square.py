@@ -48,9 +48,9 @@ class TipPath:
             route = self._routes[0]
             if len(self._routes) > 1:
                 route = min(self._routes, key=lambda route: _sharpest_turn(np.vstack([tip, route[:5]]), heading))
-            needle = {"needle_length": self._length, "speed": SPEED, "settle": 0.0}
             places = tuple(np.ravel(route).tolist())
-            self._path = PathFollower(PathFollowerSettings(waypoints=places, **needle))  # type: ignore[arg-type]
+            settings = PathFollowerSettings(waypoints=places, needle_length=self._length, speed=SPEED, settle=0.0)
+            self._path = PathFollower(settings)
         command = self._path.compute_command(stamp, pose[:2], heading, age)
         self._tips.append(pose[:2] + self._length * heading)
         self._setpoints.append(command.tip)
@@ -94,9 +94,13 @@ class Square(TipPath):
         turned = [np.roll(way, k, axis=0) for way in (corners, corners[::-1]) for k in range(4 if any_corner else 1)]
         routes = [np.vstack([way, way[:1]]) for way in (turned if any_corner else turned[:1])]
         super().__init__(coils.needle_length, *routes)
-        bare = {"needle_drag": coils.needle_drag - coils.thread_drag, "thread_drag": 0.0}
-        slow = {"without_prediction": "slow", "speed_without_prediction": 2.0 * SPEED}
-        self.settings: CoilBridgeSettings = replace(coils, **bare, **slow)  # type: ignore[arg-type]
+        self.settings: CoilBridgeSettings = replace(
+            coils,
+            needle_drag=coils.needle_drag - coils.thread_drag,
+            thread_drag=0.0,
+            without_prediction="slow",
+            speed_without_prediction=2.0 * SPEED,
+        )
 
 
 def pulls(dish_radius: float, count: int, *, left: bool = True) -> list[Points]:

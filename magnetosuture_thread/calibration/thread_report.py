@@ -57,7 +57,7 @@ def write_thread(folder: Path, result: ThreadResult, setup: Setup, date: str) ->
     if result.fit is not None:
         part["warnings"] = result.fit.warnings
     if result.drag is not None:
-        part |= {"pulls": result.drag.pulls, "own_drag_by_pulls": result.drag.own}
+        part |= {"pulls": result.drag.pulls, "own_drag_by_pulls": result.drag.needle}
     if result.prediction is not None:
         part["prediction"] = {"before": result.prediction.before, "after": result.prediction.after}
     if math.isfinite(result.square):

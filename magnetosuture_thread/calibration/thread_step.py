@@ -128,8 +128,8 @@ class ThreadCommissioning:
         radius, length = self.setup.scene.dish.radius, self.setup.coils.needle_length
         if problem := self._follow("fitted", TipPath(length, *pulls(radius, PULLS)), self.setup)[1]:
             return [f"fitted: {problem}"]
-        path, selection = self._folder / self._bags["fitted"], {"source": "poses", "setup_name": str(self.setup.path)}
-        fit = calibrate_bags([path], spare / THREAD_FILE, log=self._log, **selection)  # type: ignore[arg-type]
+        path, name = self._folder / self._bags["fitted"], str(self.setup.path)
+        fit = calibrate_bags([path], spare / THREAD_FILE, log=self._log, source="poses", setup_name=name)
         if not fit.finished:  # `calibrate` keeps what it has when it is interrupted
             raise KeyboardInterrupt
         self._result = ThreadResult(fit=fit)
@@ -193,8 +193,8 @@ class ThreadCommissioning:
                 instants.append((event.result.prediction.positions.copy(), event.observation.measured))
 
         def measure(setup: Setup, write: Callable[[Event], None]) -> RunMetrics:
-            path, chosen = self._folder / self._bags["predicted"], {"setup_name": str(setup.path), "source": "poses"}
-            with open_bag(path, lambda line: None, **chosen) as bag:  # type: ignore[arg-type]
+            path = self._folder / self._bags["predicted"]
+            with open_bag(path, lambda line: None, setup_name=str(setup.path), source="poses") as bag:
                 return measure_run(bag, setup.model, write=write).metrics
 
         before, metrics = measure(self.setup, lambda event: None), measure(after, keep)
@@ -240,7 +240,7 @@ def values_of(fit: CalibrationResult, drag: ThreadDrag, believed: CoilBridgeSett
 
 def drag_failures(drag: ThreadDrag, bare: float) -> list[str]:
     """Return why a drag is no measurement, beside that of the bare needle [N s/m]."""
-    (along, interval), own = drag.along, drag.own
+    (along, interval), own = drag.along, drag.needle
     words = f"the needle's own drag is {own:.3g} N s/m, {bare:.3g} without thread: another needle, or liquid"
     wide = f"thread_drag is {along:.3g} ± {interval:.2g} N s/m (±{DRAG_INTERVAL:.0%} allowed)"
     checks = (not 0.0 <= interval <= DRAG_INTERVAL * along, wide), (abs(own / bare - 1.0) > OWN_DRAG_ERROR, words)

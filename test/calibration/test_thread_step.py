@@ -59,7 +59,7 @@ def test_the_balance_of_forces_tells_the_drags_of_a_thread_in_any_shape():
     ):
         assert abs(value - truth) < interval
         assert interval < 0.1 * truth
-    assert drag.own == pytest.approx(OWN, rel=0.05)
+    assert drag.needle == pytest.approx(OWN, rel=0.05)
     assert drag.pulls == 8
 
 
@@ -76,7 +76,7 @@ def test_what_all_coils_are_wrong_by_is_within_the_interval():
 
 def test_another_needle_and_a_drag_that_is_hardly_known_are_refused():
     other = measure_drag(some_pulls(own=1.5 * OWN), (OWN, 2e-4))
-    assert other.own == pytest.approx(1.5 * OWN, rel=0.05)
+    assert other.needle == pytest.approx(1.5 * OWN, rel=0.05)
     assert "another needle, or liquid" in drag_failures(other, OWN)[-1]
     assert drag_failures(measure_drag(some_pulls(), (OWN, 2e-4)), OWN) == []
     (words,) = drag_failures(measure_drag(some_pulls(), (OWN, 0.5 * OWN)), OWN)
