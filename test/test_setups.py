@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.closed_loop import PathControl
 from magnetosuture_thread.forecast.forecaster import make_forecaster
+from magnetosuture_thread.planning.follower import SmoothPath
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
+from magnetosuture_thread.rig.closed_loop import ClosedLoop
 from magnetosuture_thread.rig.dynamics import NeedleBody
+from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.files import find_file, share_directory
@@ -73,6 +77,28 @@ def test_in_every_setup_that_ships_the_needle_gets_to_the_end_of_its_path_throug
             tail, heading, *safety.kinematics.body_velocity(heading, velocity), interval
         )
     assert np.mean(shares) > 0.95, np.mean(shares)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHIPPED)
+def test_in_every_setup_that_ships_the_coils_take_the_needle_along_its_path(name: str):
+    """In ground truth, with its thread, with poses that come late and get lost, to the end and close by."""
+    setup = read_setup(name)
+    control = PathControl(setup)
+    loop = ClosedLoop(setup, Rig(setup.rig, setup.scene), control, losses=0.1, latency=0.05)
+    tips: list[np.ndarray] = []
+    while not control.done:
+        if frame := loop.step():
+            heading = np.array([np.cos(frame.heading), np.sin(frame.heading)])
+            tips.append(setup.coils.needle().kinematics.tip(frame.tail, heading))
+            assert "follow" not in frame.reason
+        assert loop.now < 120.0
+    angle = setup.rig.needle_start[2]
+    waypoints = np.vstack([tips[0], np.reshape(setup.follower.waypoints, (-1, 2))])
+    path = SmoothPath(waypoints, np.array([np.cos(angle), np.sin(angle)]))
+    points = np.array([path.point(length) for length in np.arange(0.0, path.length, 1e-4)])
+    off = max(np.hypot(*(points - tip).T).min() for tip in tips)
+    assert off < 2e-3
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,11 @@ class CoilBridgeSettings(
     )
     coil_radius: float = quantity(0.025, "mean radius of a coil's windings", unit="m", minimum=0.002, maximum=0.5)
     aligning_field: float = quantity(
-        0.008, "field along the needle that holds its direction", unit="T", minimum=1e-4, maximum=1.0
+        0.008,
+        "field along the needle, which holds its direction; a stronger one pulls it more, a weaker one lets a thread turn it",
+        unit="T",
+        minimum=1e-4,
+        maximum=1.0,
     )
     needle_moment: float = quantity(
         8.8e-4, "magnetic moment of the straight needle", unit="A m^2", minimum=1e-6, maximum=1.0

@@ -88,7 +88,7 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
                 host_rig(options.setup, options.output, threaded=options.threaded, **chosen)
                 return None
             summary = simulate(options.setup, options.output, procedure=options.procedure, **chosen)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, GraphError):
         if new and options.output.exists():
             terminal.log(f"what was recorded is in {options.output}")
         raise
@@ -373,7 +373,7 @@ class _Run:
         if problem is None:
             raise KeyboardInterrupt
         if problem and self.task.result is None:
-            raise GraphError(f"{problem}; what was recorded is in {output}")
+            raise GraphError(problem)
         return problem
 
     def _record(self, folder: Path, name: str) -> str | None:
