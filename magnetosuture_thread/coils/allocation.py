@@ -32,7 +32,7 @@ CURRENT_WEIGHT = 1e-3
 HEADING_ERROR = 0.006  # rad; of a needle's measured pose
 HEADING_STEP, PLACE_STEP = 0.01, 1e-4  # rad and m; for the derivatives by heading and place
 COIL_ERROR = 0.015  # of a coil's field, with its gain estimated: in some seconds, by a needle that is driven
-CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
+DRIVEN_SPEED = 6.25e-3  # m/s; by a pull that is held: a needle turned off its direction goes aside by a part of it
 FIELD_ROUNDS, FIELD_TOLERANCE = 6, 0.03  # solutions, until the field along the needle is known to this share
 LEAST_FIELD = 1e-6  # T; in a weaker one the needle is turned by its torque alone
 MAX_EXCHANGES = 50  # of currents at and off their limits, some for each coil; the last are within limits too
@@ -332,8 +332,8 @@ def allocate_currents(data: AllocationData, request: Request, x: float, y: float
         if not request.at_tip:  # else a drift by such an error is corrected by the turn, as any other
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
             # the needle takes large currents whose fields cancel each other, and their errors do not.
-            swung = lever / CORRECTION_TIME * rows[2, k] / least
-            drift = COIL_ERROR / across_speed * math.hypot(rows[1, k], swung)
+            aside = DRIVEN_SPEED * rows[2, k] / least
+            drift = COIL_ERROR / across_speed * math.hypot(rows[1, k], aside)
             system[5 + k, k] = math.hypot(system[5 + k, k], drift)
             misaligned[k] = (turned[1, k] - rows[1, k]) / (HEADING_STEP * across_speed)
     target[0], target[3] = request.along / along_speed, request.across / across_speed

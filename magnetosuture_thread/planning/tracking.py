@@ -21,7 +21,7 @@ NO_PULL.flags.writeable = False
 MAX_PLACE_GAIN = 8.0  # 1/s; at which 10 um of noise of a pose are a velocity of 0.1 mm/s
 MAX_ACROSS = 4e-3  # m/s; of the correction across the needle, which a pull that changes has to outlast
 TURN_GAIN = 6.0  # 1/s; on the error of the direction
-LOOKAHEAD = 8e-4  # m; how far ahead on the path a needle is directed that no force brings back
+LOOKAHEAD = 0.64  # of half the chord; how far ahead on the path a needle is directed that no force brings back
 MIN_STEERED = 0.2  # share of the place that is corrected by the direction, where force can do all of it
 FORCE_RESERVE = 4.0  # by which force across the needle has to exceed what it is needed for, to do all of it
 ACCELERATION = 0.008  # m/s^2
@@ -76,10 +76,10 @@ class PathTracker:
     The setpoint's speed has a trapezoidal profile between the places where the needle changes between ahead and back.
     It waits while the needle is farther behind it than `MAX_LAG`, or `MAX_ANGLE` off its direction.
 
-    The direction corrects the place where force cannot: delta = s sign(u_r) atan(y / `LOOKAHEAD`), with the error y
-    across the path, the share s of the way that is driven, not turned on the spot, and a weight that falls to
-    `MIN_STEERED` where force has plenty in reserve. Along the axes of the coils no currents give a force across the
-    needle. Where a pull d is measured, with the part d_a across an axis, theta stays off that by
+    The direction corrects the place where force cannot: delta = s sign(u_r) atan(y / L), with the error y across the
+    path, `LOOKAHEAD` half chords L, the share s of the way that is driven, not turned on the spot, and a weight that
+    falls to `MIN_STEERED` where force has plenty in reserve. Along the axes of the coils no currents give a force
+    across the needle. Where a pull d is measured, with the part d_a across an axis, theta stays off that by
 
         max(min(|d_a| / a, `MAX_ANGLE`), min(|d| / a, `MAX_AXIS_ANGLE`))
 
@@ -158,8 +158,9 @@ class PathTracker:
         off = place + self._before_crossing(direction, pull) * normal - middle
         along, across = float(off @ e), float(off @ normal)
         gain = min(MAX_PLACE_GAIN, delayed_gain(age, interval))
+        lookahead = LOOKAHEAD * max(self.path.lever, 1e-9)
         steered = self._steered(angle, abs(float(pull @ n)) + gain * abs(across))
-        course = min(allowed, max(-allowed, steered * driven * sense * math.atan(across / LOOKAHEAD)))
+        course = min(allowed, max(-allowed, steered * driven * sense * math.atan(across / lookahead)))
         # Of the way, to the left of the needle [rad]; along itself where nobody is known to move it across.
         aside = turn + course if pull.any() else 0.0
         off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, pull)))
