@@ -54,6 +54,14 @@ CHANGE, SET, GET = "change_state", "set_parameters_atomically", "get_parameters"
 Receive: TypeAlias = "Callable[[str, int, bytes], None]"  # called with topic, time of arrival [ns] and CDR bytes
 
 
+class _ClientNode(GuardedNode):
+    """A node without services for its parameters: whoever made it may give it the clock of the graph."""
+
+    @property
+    def is_configured(self) -> bool:
+        return False
+
+
 class Participant(ExitStack):
     """A node in a graph, in a context of its own, until it is closed; a context manager too.
 
@@ -78,7 +86,7 @@ class Participant(ExitStack):
         values = {"start_type_description_service": False, "use_sim_time": simulated_clock}
         parameters = [Parameter(key, value=value) for key, value in values.items()]
         options: dict[str, Any] = {"parameter_overrides": parameters, "start_parameter_services": False}
-        self.node = GuardedNode(name, context=context, namespace=namespace, **options)
+        self.node = _ClientNode(name, context=context, namespace=namespace, **options)
         self.callback(self.node.destroy_node)
         executor = KeptWaitSetExecutor(context=context)
         self.callback(executor.shutdown)

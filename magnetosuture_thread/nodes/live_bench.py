@@ -19,6 +19,7 @@ from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.msg import CoilBridgeState
 from magnetosuture_msgs.srv import GivePulse
 from numpy.typing import NDArray
+from rclpy.parameter import Parameter
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.bags import reading
@@ -379,6 +380,8 @@ class LiveBench(clients.CoilClient):
 class LiveThreadBench(LiveBench):
     """See `ThreadBench`: a rig that runs with the setup of its commissioning, a thread at the needle, in an empty dish.
 
+    Its clock is the rig's, also where that is a simulated one.
+
     Raises:
         ConfigurationError: the scene of the rig is not the setup's.
         GraphError: bridge, tracker or thread model are not there, or something stops the coils.
@@ -410,6 +413,7 @@ class LiveThreadBench(LiveBench):
 
     def _begin(self) -> None:
         self.wait(clients.DISCOVERY_TIME)
+        self.node.set_parameters([Parameter("use_sim_time", value=self._parameters(BRIDGE, "use_sim_time")[0])])
         self._make_ready(self._wait_for_state())
         found, version = self._state.value.scene_version, self._setup.scene.version
         if found != version:

@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 from magnetosuture_msgs.msg import CoilCurrents
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.calibration.square import TipPath
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.geometry.scene import Dish, Scene
@@ -243,14 +246,31 @@ class FirstStretch(TipPath):
         return 0.0 * super().command(stamp, pose, age)
 
 
-def test_a_path_is_followed_with_the_values_of_a_setup_and_recorded(
-    graph: Any, setup: Setup, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+class SlowClock(ManagedNode[VisionTrackerSettings]):
+    """A clock that goes at half the speed of the computer's, from 1 s on."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("slow_clock", VisionTrackerSettings, **options)
+        began, published = time.time(), topics.CLOCK.publisher(self)
+
+        def publish() -> None:
+            now = Time(seconds=1.0 + 0.5 * (time.time() - began))
+            published.publish(Clock(clock=now.to_msg()))
+
+        self.create_timer(0.01, publish)  # by the computer's clock, which this node has
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_path_is_followed_with_the_values_of_a_setup_and_recorded_on_the_rig_s_clock(
+    graph: Any, setup: Setup, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, simulated: bool
 ):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
     monkeypatch.setattr(live_bench, "PATIENCE", 30.0)  # s; of a busy machine
     alone = {"commissioning": False, "without_prediction": "slow", "speed_without_prediction": 2e-3}
-    bridge = graph.add(CoilBridgeNode, **{**BRIDGE, **alone})
-    graph.add(FakeTracker)
+    if simulated:
+        graph.add(SlowClock)
+    bridge = graph.add(CoilBridgeNode, use_sim_time=simulated, **{**BRIDGE, **alone})
+    graph.add(FakeTracker, use_sim_time=simulated)
     before = bridge.configured_settings.max_pull
     other = replace(setup, coils=replace(setup.coils, max_pull=3.0 * setup.coils.max_pull)).with_scene(setup.scene)
     path = FirstStretch(7e-3, np.array([[6e-3, 0.0], [8e-3, 0.0]]))
@@ -260,9 +280,11 @@ def test_a_path_is_followed_with_the_values_of_a_setup_and_recorded(
         assert bridge.configured_settings.max_pull == other.coils.max_pull
         assert not bridge.system.latch.armed
     assert bridge.configured_settings.max_pull == before
-    counts = Bag(tmp_path / "bag").counts
+    bag = Bag(tmp_path / "bag")
+    counts = bag.counts
     assert counts[interface.NEEDLE_POSE.recorded] >= 40
     assert counts[interface.CURRENTS.recorded] > 10
     assert counts[interface.SCENE.recorded] == 1
+    assert all((stamp_of(record) < 1e12) is simulated for record in bag.records({interface.NEEDLE_POSE.recorded}))
     with pytest.raises(ConfigurationError, match=r"scene of the rig: got .* the setup's dish without shapes"):
         LiveThreadBench(setup.with_scene(Scene(Dish(0.05))), lambda: None)
