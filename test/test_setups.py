@@ -82,7 +82,7 @@ def test_in_every_setup_that_ships_the_needle_gets_to_the_end_of_its_path_throug
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_in_every_setup_that_ships_the_coils_take_the_needle_along_its_path(name: str):
-    """In ground truth, with its thread, with poses that come late and get lost, to the end and close by."""
+    """In ground truth, with its thread, with poses that come late and get lost, within a quarter of the needle."""
     setup = read_setup(name)
     control = PathControl(setup)
     loop = ClosedLoop(setup, Rig(setup.rig, setup.scene), control, losses=0.1, latency=0.05)
@@ -98,7 +98,7 @@ def test_in_every_setup_that_ships_the_coils_take_the_needle_along_its_path(name
     path = SmoothPath(waypoints, np.array([np.cos(angle), np.sin(angle)]))
     points = np.array([path.point(length) for length in np.arange(0.0, path.length, 1e-4)])
     off = max(np.hypot(*(points - tip).T).min() for tip in tips)
-    assert off < 2e-3
+    assert off < 0.25 * setup.coils.needle_length
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ CURRENT_WEIGHT = 1e-3
 HEADING_ERROR = 0.006  # rad; of a needle's measured pose
 HEADING_STEP, PLACE_STEP = 0.01, 1e-4  # rad and m; for the derivatives by heading and place
 COIL_ERROR = 0.015  # of a coil's field, with its gain estimated: in some seconds, by a needle that is driven
-DRIVEN_SPEED = 6.25e-3  # m/s; by a pull that is held: a needle turned off its direction goes aside by a part of it
+DRIVEN_SPEED = 6.25e-3  # m/s; of a needle against a pull, to which an error of its direction adds as much across
 FIELD_ROUNDS, FIELD_TOLERANCE = 6, 0.03  # solutions, until the field along the needle is known to this share
 LEAST_FIELD = 1e-6  # T; in a weaker one the needle is turned by its torque alone
 MAX_EXCHANGES = 50  # of currents at and off their limits, some for each coil; the last are within limits too
@@ -374,7 +374,7 @@ def allocate_currents(data: AllocationData, request: Request, x: float, y: float
 class CoilAllocation:
     """Allocates coil currents for a velocity of the needle's tip.
 
-    A slender magnet in a viscous liquid aligns with the field within hundredths of a second, and is pulled
+    A slender magnet in a viscous liquid aligns with the field within hundredths of a second, or a tenth, and is pulled
     along the field's gradient. With the unit vector e from tail to tip, n across, the chord l, the
     poles -q, +q at tail and tip and q = m / length, the currents give the tip the velocity
 
@@ -393,9 +393,10 @@ class CoilAllocation:
         |(`HEADING_ERROR`, omega s_t, s |dB/dn . n| / (B . e), `COIL_ERROR` |a| / (B . e))|
 
     with the turn rate omega, the deviations s_t of the time of its pose and s of its place, and the field a of each
-    coil across it. A needle beside its place turns with the field there. Close to a coil's axis, where large fields
-    cancel each other, one that is held against a pull is therefore in an unstable balance: the later its poses are, the
-    less of the pull is held. These fields are those of the solution before, from that of the last currents on.
+    coil across it; the last, times `DRIVEN_SPEED`, is a drift too. A needle beside its place turns with the field
+    there. Close to a coil's axis, where large fields cancel each other, one that is held against a pull is therefore in
+    an unstable balance: the later its poses are, the less of the pull is held. These fields are those of the solution
+    before, from that of the last currents on.
 
     Source: none.
 

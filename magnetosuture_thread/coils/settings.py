@@ -126,7 +126,7 @@ class CoilBridgeSettings(
     coil_radius: float = quantity(0.025, "mean radius of a coil's windings", unit="m", minimum=0.002, maximum=0.5)
     aligning_field: float = quantity(
         0.008,
-        "field along the needle that holds its direction; a strong one pulls it, and off a weak one a thread turns it",
+        "field along the needle that holds its direction; a strong one also pulls it, off a weak one a thread turns it",
         unit="T",
         minimum=1e-4,
         maximum=1.0,

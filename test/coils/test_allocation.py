@@ -230,7 +230,10 @@ def test_what_is_held_for_each_radian_off_an_axis_turns_the_field_by_no_more_tha
 def test_the_less_a_pose_is_known_the_less_of_a_pull_is_held_beside_an_axis(
     degrees: float, is_held: bool, doubt: PoseDeviation
 ):
-    """There a needle that lies otherwise than it is measured is thrown; between two axes it is held all the same."""
+    """There a needle that lies otherwise than it is measured is thrown; between two axes it is held all the same.
+
+    In a field of 10 mT: what is held at all is in proportion to it.
+    """
     made = replace(read_setup("hernia_ring").coils, aligning_field=0.01).allocation()
     e = turned(EAST, np.radians(degrees))
     tail, twist = -0.5 * NEEDLE.chord * e, NeedleTwist(0.008, 2e-3, 3.0)
