@@ -149,8 +149,9 @@ def simulate(
     Raises:
         BagError: the output exists or cannot be written; where the disk was full, what was recorded is there.
         ConfigurationError: the setup cannot be used, or the procedure does not fit its scene.
-        GraphError: a node ended or did not come, or the needle never got to the end of its path.
-        KeyboardInterrupt: passed on; where the run had begun, its bag is there.
+        GraphError: a node ended or did not come, or the needle never got to the end of its path; its bag is there
+            where the run had begun.
+        KeyboardInterrupt: the same, passed on.
     """
     setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
     believed, setup = setup.rig, with_rig(setup, rig)

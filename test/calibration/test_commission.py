@@ -267,10 +267,10 @@ def test_a_square_with_a_wrong_setup_is_no_square(believed: Setup):
 
 
 def test_a_delay_that_the_bridge_is_told_keeps_the_needle_on_its_square(believed: Setup):
-    late = changed(believed, current_delay=0.08)
+    late = changed(believed, current_delay=0.1)
     _, problem = SimulatedBench(late, drawn=True).follow_square(believed.coils)
     assert problem.startswith("needle does not follow")
-    apart, problem = SimulatedBench(late, drawn=True).follow_square(replace(believed.coils, motion_delay=0.08))
+    apart, problem = SimulatedBench(late, drawn=True).follow_square(replace(believed.coils, motion_delay=0.1))
     assert problem == ""
     assert apart < 5e-4
 

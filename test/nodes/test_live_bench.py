@@ -285,6 +285,8 @@ def test_a_path_is_followed_with_the_values_of_a_setup_and_recorded_on_the_rig_s
     assert counts[interface.NEEDLE_POSE.recorded] >= 40
     assert counts[interface.CURRENTS.recorded] > 10
     assert counts[interface.SCENE.recorded] == 1
-    assert all((stamp_of(record) < 1e12) is simulated for record in bag.records({interface.NEEDLE_POSE.recorded}))
+    for record in bag.records({interface.NEEDLE_POSE.recorded}):  # a minute of the slow clock, or years of the other
+        assert (stamp_of(record) < 6e10) is simulated
+        assert (record.time < 6e10) is simulated
     with pytest.raises(ConfigurationError, match=r"scene of the rig: got .* the setup's dish without shapes"):
         LiveThreadBench(setup.with_scene(Scene(Dish(0.05))), lambda: None)
