@@ -21,7 +21,7 @@ NO_PULL.flags.writeable = False
 MAX_PLACE_GAIN = 8.0  # 1/s; at which 10 um of noise of a pose are a velocity of 0.1 mm/s
 MAX_ACROSS = 4e-3  # m/s; of the correction across the needle, which a pull that changes has to outlast
 TURN_GAIN = 6.0  # 1/s; on the error of the direction
-LOOKAHEAD = 0.64  # of half the chord; how far ahead on the path a needle is directed that no force brings back
+LOOKAHEAD = 0.64  # half chords; how far ahead on the path a needle is directed that no force brings back
 MIN_STEERED = 0.2  # share of the place that is corrected by the direction, where force can do all of it
 FORCE_RESERVE = 4.0  # by which force across the needle has to exceed what it is needed for, to do all of it
 ACCELERATION = 0.008  # m/s^2
@@ -77,7 +77,7 @@ class PathTracker:
     It waits while the needle is farther behind it than `MAX_LAG`, or `MAX_ANGLE` off its direction.
 
     The direction corrects the place where force cannot: delta = s sign(u_r) atan(y / L), with the error y across the
-    path, `LOOKAHEAD` half chords L, the share s of the way that is driven, not turned on the spot, and a weight that
+    path, the length L of `LOOKAHEAD`, the share s of the way that is driven, not turned on the spot, and a weight that
     falls to `MIN_STEERED` where force has plenty in reserve. Along the axes of the coils no currents give a force
     across the needle. Where a pull d is measured, with the part d_a across an axis, theta stays off that by
 

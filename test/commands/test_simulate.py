@@ -159,6 +159,28 @@ def test_a_run_whose_bridge_is_stopped_ends_with_the_reason(scenario: Path, tmp_
     assert not any(states[-1].current)
 
 
+@pytest.mark.parametrize("recorded", [True, False])
+def test_a_run_that_fails_names_its_bag_where_there_is_one(
+    scenario: Path,
+    tmp_path: Path,
+    recorded: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    bag = tmp_path / "bag"
+
+    def fail(setup: str, output: Path, **options: Any) -> None:
+        if recorded:
+            output.mkdir()
+        raise GraphError("coil_bridge: fault: needle does not follow")
+
+    monkeypatch.setattr(simulate_command, "simulate", fail)
+    assert main(["simulate", str(scenario), "--output", str(bag)]) == 1
+    shown = "".join("".join(capsys.readouterr()).split())
+    assert "needledoesnotfollow" in shown
+    assert (f"whatwasrecordedisin{bag}" in shown) is recorded
+
+
 def test_a_procedure_that_nobody_resumes_ends_the_run_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(simulate_command, "MAX_PAUSE", 1.0)
     (tmp_path / "near.yaml").write_text(NEAR.replace("speed: 0.003", "speed: 0.0002"))  # which leaves time to pause it
